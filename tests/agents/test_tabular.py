@@ -95,7 +95,10 @@ def transition(terminated=False, truncated=False, **changes):
 
 
 def after(agent, *steps, seed=0):
-    """What the agent's tables became, and how far that is from where they were."""
+    """What the agent's tables became, and how far that is from where they were.
+
+    steps: transitions to learn from, or other functions of the agent's state.
+    """
     task = Garnet(5, 2, 2)
     state = jit(agent.init)(task, jax.random.key(0))
     before = 10.0 * np.arange(5.0)[:, None] + np.arange(2.0)
@@ -105,7 +108,10 @@ def after(agent, *steps, seed=0):
     cells[..., 0] = before
     state = type(state)(**{**vars(state), "cells": jnp.asarray(cells)})
     for i, step in enumerate(steps):
-        state, _ = jit(agent.learn)(task, state, step, jax.random.key(seed + i))
+        if isinstance(step, Transition):
+            state, _ = jit(agent.learn)(task, state, step, jax.random.key(seed + i))
+        else:
+            state = step(state)
     return np.asarray(state.tables), np.asarray(state.tables) - before
 
 
@@ -148,6 +154,13 @@ def test_sarsa_at_the_end_of_an_episode():
     assert tables[0, 1, 0] == pytest.approx(10 + 0.1 * (2 - 10))
     # The new episode's action is not that of the state which the clock cut: the policy's is.
     tables, _ = after(agent, transition(truncated=True), fresh)
+    assert tables[0, 1, 0] == pytest.approx(10 + 0.1 * (2 + 0.9 * 31 - 10))
+
+
+def test_sarsa_after_a_cut():
+    """As after a truncation: the action of a new episode says nothing about the old one."""
+    agent = Sarsa(discount=0.9, learning_rate=0.1, epsilon_start=0.0)
+    tables, _ = after(agent, transition(), agent.cut, transition(state=0, action=0))
     assert tables[0, 1, 0] == pytest.approx(10 + 0.1 * (2 + 0.9 * 31 - 10))
 
 

@@ -1,5 +1,6 @@
 """Agents on environments of Gymnasium, stepped from Python."""
 
+import dataclasses
 import gc
 import json
 import sys
@@ -91,6 +92,12 @@ class Aim(Tiny):
         return -abs(action[0] - 1) - abs(action[1] - 30) / 10, self.t == 2, False
 
 
+class Narrow(Aim):
+    """Bounds that rounding would exceed: −0.4 + (0.3 − −0.4) is above 0.3 in float32."""
+
+    action_space = gymnasium.spaces.Box(*np.array([[-0.4, -0.7], [0.3, 0.1]], np.float32))
+
+
 class Shares(Tiny):
     """Whole numbers of three shares, at most five."""
 
@@ -146,7 +153,7 @@ class Faulty(Tiny):
         return seen, reward, False, False, {}
 
 
-KINDS = (Delay, Endless, Numbered, Aim, Shares, Signed, Named, Unbounded, Faulty)
+KINDS = (Delay, Endless, Numbered, Aim, Narrow, Shares, Signed, Named, Unbounded, Faulty)
 ENVIRONMENTS = {kind: f"Test{kind.__name__}-v0" for kind in KINDS}
 for _kind, _id in ENVIRONMENTS.items():
     gymnasium.register(_id, entry_point=_kind, max_episode_steps=4)
@@ -282,6 +289,11 @@ def test_coordinates_reach_from_bound_to_bound():
     assert population.evaluate(start_keys(3)).returns.min() > -0.3  # of two steps; at first −4
 
 
+def test_rounding_does_not_lead_beyond_a_bound():
+    given = task(Narrow).facts.given(np.array([[-1, -1], [1, 1]], np.float32))
+    np.testing.assert_array_equal(given, [Narrow.action_space.low, Narrow.action_space.high])
+
+
 def test_every_graded_episode_is_that_of_its_seed():
     """Fewer starts than lanes, as many, and more: the first are the same."""
     population = trained(task(Numbered), SMALL, [0, 1], 4)
@@ -309,6 +321,19 @@ def test_it_goes_on_from_a_checkpoint_in_new_episodes(tmp_path):
     summary = twice.summary()
     assert (summary["optimum"], summary["regret_per_seed"]) == (None, None)
     assert summary["return_per_seed"] == [1.0, 1.0]
+
+
+def test_returns_do_not_reach_from_a_cut_episode_into_a_new_one():
+    agent = dataclasses.replace(SMALL, n_steps=2)
+    ends = lambda population: stored(population).last.reshape(-1, 2)[:8, 0].tolist()  # noqa: E731
+    population = trained(task(Endless), agent, [0], 6)
+    state = population.fetch()
+    population.advance(2)
+    assert ends(population) == [False, False, False, True, False, False, False, True]
+    population.restore(state)
+    assert ends(population)[5] == False  # noqa: E712 (only if training goes on)
+    population.advance(2)
+    assert ends(population) == [False, False, False, True, False, True, False, False]
 
 
 @pytest.mark.parametrize(

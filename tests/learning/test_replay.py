@@ -7,7 +7,7 @@ from equinox import filter_jit as jit
 
 from qfolio.core.mdp import Transition
 from qfolio.learning.priorities import FAN, Priorities
-from qfolio.learning.replay import Experience, Replay, join
+from qfolio.learning.replay import Experience, Replay, cut, join
 from qfolio.learning.targets import n_step
 from qfolio.portfolio.task import Portfolio
 
@@ -116,6 +116,26 @@ def test_steps_are_joined_up_to_the_end_of_their_episode():
     np.testing.assert_array_equal(joined.next_observation[:, 0], [102, 103])
     assert joined.terminal.tolist() == [True, False]
     np.testing.assert_allclose(discount, [0.25, 0.25])
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_steps_are_not_joined_across_a_cut(width):
+    row = Experience.like((), jnp.zeros(1), jnp.array(0), with_last=True)
+    replay = Replay.empty(row, 3 * width, width, steps=2)
+    never = jnp.zeros(width, bool)
+    for i in range(4):  # the last write overwrites the first
+        seen = jnp.full((width, 1), 1.0 * i)
+        action = jnp.zeros(width, jnp.int32)
+        step = Experience(seen, action, jnp.ones(width), seen + 1, never, never)
+        replay = jit(replay.add)(step)
+        if i in (0, 2):
+            replay = jit(cut)(replay)
+    joined, discount = jit(join)(replay, jnp.array([width, 2 * width]), 0.5)
+    np.testing.assert_array_equal(joined.observation[:, 0], [1, 2])
+    np.testing.assert_array_equal(joined.next_observation[:, 0], [3, 3])
+    np.testing.assert_array_equal(joined.reward, [1.5, 1])
+    np.testing.assert_array_equal(discount, [0.25, 0.5])
+    assert not joined.terminal.any()
 
 
 def test_the_last_step_is_kept_where_it_is_asked_for():

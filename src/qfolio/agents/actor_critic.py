@@ -25,7 +25,7 @@ from qfolio.learning.networks import Flat, LateAction, Network, NetworkConfig
 from qfolio.learning.normalization import Moments, NormalizationConfig, Normalizer, normalized
 from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.positions import OrderValue, Values
-from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
+from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, cut, join
 from qfolio.learning.targets import Scalar, Scale, huber_loss, possible_values, td_target
 
 
@@ -176,7 +176,6 @@ class ActorCritic(Agent, Generic[L]):
         self._normalization.check(self.input_gain)
         self._schedule.check()
         require_counts(self, "gradient_steps")
-        require_counts(self, "episode_steps", 0)
         require(self, "actor_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
         require(self, "discount tau noise_theta", lambda x: 0 <= x <= 1, "between 0 and 1")
@@ -291,6 +290,14 @@ class ActorCritic(Agent, Generic[L]):
 
         learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         return learned, {**metrics, "q": metrics["q"] / self.reward_scale}
+
+    def cut(self, state: State) -> State:
+        noise = state.noise
+        if noise is not None:
+            noise = noise.step(self.noise_theta, jnp.ones(self.num_envs, bool))
+        return dataclasses.replace(
+            state, replay=cut(state.replay), normalizer=state.normalizer.cut(), noise=noise
+        )
 
     def carry_over(self, state: State, fresh: State) -> State:
         return eqx.tree_at(lambda s: (s.replay, s.rewards), state, (fresh.replay, fresh.rewards))

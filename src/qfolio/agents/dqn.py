@@ -37,7 +37,7 @@ from qfolio.learning.heads import HeadConfig
 from qfolio.learning.networks import Network, NetworkConfig
 from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.priorities import ImportanceSchedule, Priorities
-from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
+from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, cut, join
 from qfolio.learning.targets import bootstrap, chosen, follow, follow_when, huber_loss, td_target
 
 Weights = Network | Heads
@@ -128,7 +128,6 @@ class DQN(Agent):
         require_counts(self, "train_freq gradient_steps target_update_interval")
         require(self, "importance_steps", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-        require_counts(self, "episode_steps", 0)
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "epsilon_steps", lambda x: 0 <= x <= 1e30, "from 0 to 1e30")
         fractions = "discount tau epsilon_start epsilon_end epsilon_decay persistence"
@@ -144,8 +143,9 @@ class DQN(Agent):
         require_counts(self, "outcomes", 0)
         require(self, "bootstrap_heads", lambda x: 1 <= x <= 1000, "from 1 to 1,000")
         require(self, "caution", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
-        if self.bootstrap_heads > 1 and not self.all_actions:
-            raise QfolioError("bootstrap_heads learn from moves of a market; set all_actions=true.")
+        for name, none in (("bootstrap_heads", 1), ("outcomes", 0), ("market_baseline", False)):
+            if getattr(self, name) != none and not self.all_actions:
+                raise QfolioError(f"{name} is for moves of a market; set all_actions=true.")
         if isinstance(self.caution, float) and self.caution and self.bootstrap_heads == 1:
             raise QfolioError("caution compares heads; set bootstrap_heads to 2 or more.")
         if self.market_baseline and self.batch_size < 2:
@@ -237,6 +237,9 @@ class DQN(Agent):
 
     def monitor(self, state: DQNState) -> Metrics:
         return {"epsilon": self._epsilon(state)}
+
+    def cut(self, state: DQNState) -> DQNState:
+        return eqx.tree_at(lambda s: s.replay, state, cut(state.replay))
 
     def carry_over(self, state: DQNState, fresh: DQNState) -> DQNState:
         return eqx.tree_at(lambda s: s.replay, state, fresh.replay)

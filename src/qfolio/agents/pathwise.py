@@ -198,8 +198,8 @@ class Pathwise(OnPaths):
             raise QfolioError(
                 f"network is {self.network!r}; it must be one of {', '.join(SHARED)}."
             )
-        require_counts(self, "num_envs rollout_length gradient_steps")
-        require_counts(self, "episode_steps tail", 0)
+        require_counts(self, "rollout_length gradient_steps")
+        require_counts(self, "tail", 0)
         require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
         ratio = "slope_learning_rate_ratio"
         require(self, ratio, lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")

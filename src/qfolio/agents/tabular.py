@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require, require_counts, static
+from qfolio.core.fields import number, require, static
 from qfolio.core.mdp import Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning.exploration import EpsilonSchedule, epsilon_greedy
 from qfolio.learning.targets import bootstrap, td_target
@@ -85,7 +85,6 @@ class Tabular(Agent):
 
     def __check_init__(self) -> None:
         require(self, "num_envs", lambda x: 1 <= x <= 4096, "from 1 to 4096")
-        require_counts(self, "episode_steps", 0)
         fractions = "discount learning_rate epsilon_start epsilon_end epsilon_decay"
         require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "learning_rate_decay", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
@@ -240,3 +239,6 @@ class Sarsa(Tabular):
         state = self.update(state, last, following)
         state = eqx.tree_at(lambda s: s.last, state, move)
         return self.observe(state, rollout), {}
+
+    def cut(self, state: SarsaState) -> SarsaState:
+        return eqx.tree_at(lambda s: s.last.truncated, state, jnp.ones(self.num_envs, bool))

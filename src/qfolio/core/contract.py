@@ -83,6 +83,7 @@ def require_agent(
     _require_like(agent, "act", acts, batch.action)
     stored = _shapes(agent, "observe", state, rollout)
     _require_like(agent, "observe", stored, state, like="init")
+    _require_like(agent, "cut", _shapes(agent, "cut", state), state, like="init")
     learned = jax.eval_shape(learning_of(task, agent), task, agent, *_here((state, rollout)), key)
     if not (isinstance(learned, tuple) and len(learned) == 2):
         raise _refused(agent, "learn", learned, "the next state, and a dict of metrics")

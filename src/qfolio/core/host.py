@@ -213,6 +213,8 @@ class HostPopulation(Population):
     def advance(self, steps: int, *, strict: bool = True) -> Episodes:
         if not self._environments:
             self._environments = [self._make(seed) for seed in self.seeds]
+            if self.steps:  # of earlier environments
+                self._cut()
         steps, learning = self._plan(steps, self._rows)
         players = [self._play(member, steps, learning) for member in range(len(self.seeds))]
         records = _stack(_take_turns(players))
@@ -236,6 +238,14 @@ class HostPopulation(Population):
         judged = _take_turns([self._judge(member, seeds) for member in range(len(self.seeds))])
         unknown: Any = np.full(len(self.seeds), np.nan)
         return Greedy(_stack(judged), unknown)
+
+    def _cut(self) -> None:
+        """Tells the agents that their episodes were cut off."""
+        cut = eqx.filter_jit(lambda agent, state: agent.cut(state))
+        self._states = [
+            eqx.tree_at(lambda s: s.agent, state, cut(self.agent, state.agent))
+            for state in self._states
+        ]
 
     def _make(self, seed: int) -> Environments:
         """A member's environments; all their randomness derives from its seed and step."""

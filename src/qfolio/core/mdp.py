@@ -344,6 +344,14 @@ class Agent(eqx.Module):
     def weights(self, state: Any) -> PyTree:
         """The part of the state that the learned policy needs."""
 
+    def cut(self, state: Any) -> Any:
+        """The state after all current episodes were cut off from outside (default: ``state``).
+
+        Called where a run is resumed whose environments cannot be: the last steps so far lead to no
+        other, like steps at which an episode is truncated.
+        """
+        return state
+
     def carry_over(self, state: Any, fresh: Any) -> Any:
         """The state with which learning continues on other data (default: ``state``).
 

@@ -92,6 +92,13 @@ class Normalizer(eqx.Module):
             rewards = rewards.update(rollout.reward, finished, discount)
         return Normalizer(observations, rewards)
 
+    def cut(self) -> "Normalizer":
+        """The statistics with sums of rewards that start again, as at the end of all episodes."""
+        if self.rewards is None:
+            return self
+        rewards = RewardScale(jnp.zeros_like(self.rewards.returns), self.rewards.moments)
+        return Normalizer(self.observations, rewards)
+
     def observation(self, observation: PyTree) -> PyTree:
         """Observations, normalized if the agent does so."""
         return normalized(self.observations, observation)

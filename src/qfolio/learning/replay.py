@@ -75,7 +75,7 @@ class ReplayConfig(NamedTuple):
 
     def check(self) -> None:
         """Raises QfolioError if the settings are invalid."""
-        require_counts(self, "num_envs batch_size n_steps")
+        require_counts(self, "batch_size n_steps")
         require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         require_counts(self, "learning_starts", 0)
         joined = self.n_steps * self.num_envs
@@ -209,6 +209,15 @@ class Replay(eqx.Module):
                 for part, leaf in zip(parts, leaves, strict=True)
             ],
         )
+
+
+def cut(replay: Replay) -> Replay:
+    """The buffer with the experience written last marked as the end of its episodes."""
+    if replay.steps == 1:
+        return replay
+    latest = (replay.position - replay.width) % replay.rows.shape[0] + jnp.arange(replay.width)
+    marked = replay.rows.at[latest, -1].set(1.0)  # ``last``, the last number of a row
+    return dataclasses.replace(replay, rows=marked)
 
 
 def join(replay: Replay, index: Int[Array, " n"], discount: Scalar) -> tuple[Experience, Discount]:
