@@ -26,7 +26,7 @@ def test_numbers_of_the_charts(data: BacktestData, page: Page) -> None:
     assert dqn["band"]["low"][-1] == pytest.approx(wealth.min(), rel=1e-3)
     assert dqn["band"]["high"][-1] == pytest.approx(wealth.max(), rel=1e-3)
     assert dqn["cost"][-1] == pytest.approx(1 - np.prod(1 - series.cost, axis=1).mean(), rel=0.01)
-    january = data.dates.astype("datetime64[M]") == np.datetime64("2001-01")
+    january = data.trades.astype("datetime64[M]") == np.datetime64("2001-01")
     traded = series.turnover[:, january].sum(axis=1).mean()
     assert dqn["turnover"][0] == pytest.approx(traded, rel=1e-3)
     assert min(equal["drawdown"]) < 0 == max(equal["drawdown"])

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from qfolio.portfolio.backtest.statistics.differences import Finding
@@ -194,7 +195,18 @@ def test_each_agent_has_one_line_of_two_verdicts(plain: BacktestData) -> None:
 
 
 def test_the_best_strategies_are_named(plain: BacktestData) -> None:
-    assert best_sentence(plain).startswith("Best of all 7 strategies, seen in hindsight: pathwise,")
+    assert best_sentence(plain).startswith("Best of all 8 strategies, seen in hindsight: pathwise,")
+
+
+def test_a_speed_of_the_reference_can_be_the_best(plain: BacktestData) -> None:
+    """Also one that is not drawn, because it is not the best rebalancing in growth."""
+    calm = replace(plain.strategies["never"], returns=np.full((1, 300), 1e-4))
+    calm.returns[0, ::2] += 1e-6
+    strategies = {**plain.strategies, "never": calm}
+    data = make_data(strategies, plain.dates, plain.assets)
+    said = best_sentence(data)
+    assert "pathwise in growth" in said
+    assert ", never in Sharpe ratio" in said
 
 
 def test_without_agents_the_reference_leads(plain: BacktestData) -> None:

@@ -36,6 +36,40 @@ def test_figures_are_means_over_seeds() -> None:
     assert len(rows) == 34  # without net exposure, as nothing is sold short
 
 
+@pytest.mark.parametrize(("months", "counted"), [(1, 29), (3, 29), (12, 27)])
+def test_long_rows_have_no_figures_of_shorter_times(months: int, counted: int) -> None:
+    """A monthly value at risk of quarterly rows would be the quarterly one."""
+    data = usual(60)
+    dates = (np.datetime64("2001-01") + months * np.arange(60)).astype("datetime64[s]")
+    test = replace(data.assessment, periods_per_year=12 / months)
+    data = replace(data, dates=dates, assessment=test)
+    rows = [name for _, group in tear_sheet(["DQN"], data)["groups"] for name, _ in group]
+    assert len(set(rows)) == len(rows) == counted
+    assert any("month" in row for row in rows) == (months == 1)
+    assert ("Best year" in rows) == (months < 12)
+
+
+def test_a_record_begins_with_the_first_trade() -> None:
+    returns = np.array([[-0.1, 0.05, 0.2]])
+    dates = np.array(["2002-01-31", "2002-02-28", "2002-03-31"], "datetime64[s]")
+    data = replace(usual(3), dates=dates, begin=np.datetime64("2001-12-31", "s"))
+    one = replace(data.strategies["third"], returns=returns)
+    data = replace(data, strategies={**data.strategies, "third": one})
+    (fall, *_) = tear_sheet(["third"], data)["each"][0]["drawdowns"]
+    assert fall[:3] == ["2001-12-31", "2002-01-31", "2002-03-31"]
+
+
+def test_value_at_risk_is_the_same_everywhere() -> None:
+    data = usual(300)
+    series = data.strategies["DQN"]
+    wild = replace(series, returns=series.returns * np.array([[1.0], [2.0], [5.0]]))
+    sheet = tear_sheet(["DQN"], replace(data, strategies={**data.strategies, "DQN": wild}))
+    rows = {name: cells for _, group in sheet["groups"] for name, cells in group}
+    label = sheet["each"][0]["histogram"]["label"]
+    assert rows["Value at risk, 95%, daily"][0] in label
+    assert rows["CVaR, 95%, daily"][0] in label
+
+
 def test_interest_on_cash_is_no_alpha() -> None:
     data, rate = usual(300), np.full(300, 0.05 / 252)
     market = data.strategies["equal weight"]

@@ -20,9 +20,9 @@ def describe_backtest(backtest: "Backtest") -> str:
     config, size = backtest.config, memory.needed(backtest.prices, backtest.config)
     large = f" It needs about {size / 2**30:.1f} GiB of memory, beside what training takes."
     folds, seeds = amount(len(backtest.folds), "fold"), amount(config.seeds, "seed")
-    first = backtest.prices.dates[backtest.folds[0].decisions.start]
+    first, last = backtest.dates[[0, -1]]
     return (
-        f"{folds} ({day(first)} to {day(backtest.dates[-1])}) · "
+        f"{folds} ({day(first)} to {day(last)}) · "
         f"{amount(len(backtest.prices.assets), 'asset')} · {' and '.join(backtest.agents)} · "
         f"{seeds} · {config.cost * 1e4:g} bp · lag {config.lag} · {config.device}"
         + (f".{large}" if size > memory.MENTIONED else "")

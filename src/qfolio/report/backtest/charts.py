@@ -32,14 +32,13 @@ def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> 
     days = len(data.dates)
     # The last day of every block, preceded by the start.
     ends = np.arange(days - 1, -1, -days_per_point(days))[::-1]
-    start = data.dates[:1] - min(np.timedelta64(1, "D"), *np.diff(data.dates[:2]))
-    _, firsts = np.unique(data.dates.astype("datetime64[M]"), return_index=True)
+    _, firsts = np.unique(data.trades.astype("datetime64[M]"), return_index=True)
     window = rolling_window(data)
     return {
         "themes": {"light": palette.LIGHT, "dark": palette.DARK},
-        "dates": texts(np.concatenate([start, data.dates[ends]])),
+        "dates": texts(np.concatenate([data.trades[:1], data.dates[ends]])),
         "hidden": [place for place, name in enumerate(names) if name in faint_names(data)],
-        "months": texts(data.dates[firsts]),
+        "months": texts(data.trades[firsts]),
         "strategies": [
             {
                 "color": looks[name].color,
@@ -64,13 +63,13 @@ def rolling_window(data: BacktestData) -> int:
 def _rolling(
     name: str, data: BacktestData, ends: NDArray[np.intp], window: int
 ) -> dict[str, list[float | None]]:
-    """Rolling Sharpe ratio and beta to the reference, averaged over the seeds."""
+    """Rolling Sharpe ratio and beta to the reference, means over the seeds, as they are shown."""
     returns, year = data.strategies[name].returns, data.assessment.periods_per_year
     reference = data.strategies[data.assessment.reference].returns[0]
     excess = returns if data.risk_free is None else returns - data.risk_free
     both = rolling_sharpe(excess, window, year), rolling_beta(returns, reference, window)
-    sharpe, beta = (np.append(np.nan, values.mean(axis=0)[ends]) for values in both)
-    return {"sharpe": compact(sharpe, 3), "beta": compact(beta, 3)}
+    sharpe, beta = (np.append(np.nan, values.mean(axis=0)[ends]).round(2) for values in both)
+    return {"sharpe": compact(sharpe), "beta": compact(beta)}
 
 
 def _lines(
@@ -87,7 +86,7 @@ def _lines(
         else None,
         "drawdown": compact(np.append(0, -deepest)),
         "cost": compact(np.append(0, cost_share(series)[ends])),
-        "turnover": compact(np.add.reduceat(series.turnover.mean(axis=0), months)),
+        "turnover": compact(np.add.reduceat(series.turnover.mean(axis=0), months), 5),
     }
 
 

@@ -67,9 +67,10 @@ def backtest_data(
         notes=list(notes),
         training={name: folds for name in backtest.agents if (folds := _training(backtest, name))},
         why=why,
-        moves=backtest.replay.relatives - 1,
+        moves=backtest.replay.growth[:, 1:] - 1,
         capacity=capacity(backtest.replay, entries, assessment.reference),
         risk_free=backtest.replay.growth[:, 0] - 1,
+        begin=backtest.prices.dates[backtest.replay.rows[0]],
     )
 
 

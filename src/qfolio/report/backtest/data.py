@@ -71,6 +71,7 @@ class BacktestData:
             without them, the page does not say what each asset contributed.
         capacity: Growth by capital, if costs depend on it.
         risk_free: Simple returns of cash on these days, shape (D,) (default: 0).
+        begin: The date of the first trade, from which the first return was earned.
     """
 
     title: str
@@ -88,6 +89,15 @@ class BacktestData:
     moves: Floats | None = None
     capacity: Capacity | None = None
     risk_free: Floats | None = None
+    begin: np.datetime64 | None = None
+
+    @property
+    def trades(self) -> NDArray[np.datetime64]:
+        """The dates of the trades before each return, shape (D,)."""
+        begin = self.begin
+        if begin is None:  # a day before the first return, or less if rows are closer
+            begin = self.dates[0] - min(np.timedelta64(1, "D"), *np.diff(self.dates[:2]))
+        return np.append(begin, self.dates[:-1])
 
 
 def require_fit(data: BacktestData) -> None:

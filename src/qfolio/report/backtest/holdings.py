@@ -34,7 +34,7 @@ def holdings(names: list[str], data: BacktestData) -> dict[str, Any]:
     reference, known = data.strategies[name].weights, data.strategies[name].weighted
     base = _averages(reference, blocks)
     return {
-        "dates": texts(data.dates[centers]),
+        "dates": texts(data.trades[centers]),
         "reference": names.index(name) if known else None,
         "effective": compact(_averages(effective_number(reference), blocks), 3) if known else None,
         "series": [

@@ -126,9 +126,10 @@ def _others(names: list[str], test: Assessment, better: bool = False) -> str:
 def best_sentence(data: BacktestData) -> str:
     """Which strategy was best over the days of the test, by growth and by Sharpe ratio.
 
-    With the difference in Sharpe ratio of the agent at the top of the page to the best baseline.
+    Each speed of rebalancing the reference is one. With the difference in Sharpe ratio of the agent
+    at the top of the page to the best baseline.
     """
-    measured = {name: data.assessment.strategies[name].measures for name in shown_order(data)}
+    measured = {name: found.measures for name, found in data.assessment.strategies.items()}
 
     def best(key: str) -> str:
         return max(measured, key=lambda name: (measured[name][key].mean, name))

@@ -17,7 +17,6 @@ from qfolio.portfolio.backtest.statistics.tearsheet import (
     falls,
     figures,
     leverage,
-    value_at_risk,
 )
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.backtest.facts import unit_of
@@ -45,16 +44,17 @@ def tear_sheet(names: list[str], data: BacktestData) -> dict[str, Any]:
     reference = data.strategies[data.assessment.reference].returns
     return {
         "names": names,
-        "groups": _groups(found, unit, data.assessment.reference),
+        "groups": _groups(found, unit, year, data.assessment.reference),
         "every": PERIODS.get(unit, "single"),
         "each": [
             {
                 "name": name,
+                "several": len(data.strategies[name].returns) > 1,
                 "drawdowns": _drawdowns(data.strategies[name], data),
-                "histogram": _histogram(data.strategies[name].returns, reference, edges),
+                "histogram": _histogram(data.strategies[name].returns, reference, edges, of),
                 "assets": _assets(data.strategies[name], data, year),
             }
-            for name in names
+            for name, of in zip(names, found, strict=True)
         ],
     }
 
@@ -78,15 +78,24 @@ def _means(name: str, data: BacktestData, year: float) -> dict[str, float]:
 
 
 def _groups(
-    found: list[dict[str, float]], unit: str, reference: str
+    found: list[dict[str, float]], unit: str, per_year: float, reference: str
 ) -> list[tuple[str, list[Any]]]:
-    """Groups of rows: a name, and a cell for each strategy."""
+    """Groups of rows: a name, and a cell for each strategy.
+
+    Figures of months and years are left out where single periods are as long.
+    """
     # Without short positions, the net exposure is the gross one.
     short = any(each["gross"] - each["net"] > 1e-6 for each in found)
     every = PERIODS.get(unit, "of a period")
 
     def row(name: str, key: str, form: str) -> tuple[str, list[str]]:
         return name, [_written(each[key], form) for each in found]
+
+    def monthly(*of: tuple[str, str, str]) -> list[tuple[str, list[str]]]:
+        return [row(*each) for each in of if per_year > 13]
+
+    def yearly(*of: tuple[str, str, str]) -> list[tuple[str, list[str]]]:
+        return [row(*each) for each in of if per_year > 1]
 
     return [
         (
@@ -96,12 +105,10 @@ def _groups(
                 row("Total return", "total", "%"),
                 row(f"Best {unit}", "best", "+%"),
                 row(f"Worst {unit}", "worst", "+%"),
-                row("Best month", "best_month", "+%"),
-                row("Worst month", "worst_month", "+%"),
-                row("Best year", "best_year", "+%"),
-                row("Worst year", "worst_year", "+%"),
+                *monthly(("Best month", "best_month", "+%"), ("Worst month", "worst_month", "+%")),
+                *yearly(("Best year", "best_year", "+%"), ("Worst year", "worst_year", "+%")),
                 row(f"{unit.capitalize()}s with a gain", "hit_rate", "%"),
-                row("Months with a gain", "hit_rate_month", "%"),
+                *monthly(("Months with a gain", "hit_rate_month", "%")),
                 row(f"Longest winning streak, {unit}s", "winning", "0"),
                 row(f"Longest losing streak, {unit}s", "losing", "0"),
             ],
@@ -116,8 +123,10 @@ def _groups(
                 row("Ulcer index", "ulcer", "%"),
                 row(f"Value at risk, 95%, {every}", "var", "%2"),
                 row(f"CVaR, 95%, {every}", "cvar", "%2"),
-                row("Value at risk, 95%, monthly", "var_month", "%"),
-                row("CVaR, 95%, monthly", "cvar_month", "%"),
+                *monthly(
+                    ("Value at risk, 95%, monthly", "var_month", "%"),
+                    ("CVaR, 95%, monthly", "cvar_month", "%"),
+                ),
                 row("Skewness", "skewness", "2"),
                 row("Kurtosis (normal: 3)", "kurtosis", "1"),
                 row("Gross leverage", "gross", "2"),
@@ -133,7 +142,11 @@ def _groups(
                 row(f"Alpha a year, beside {reference}", "alpha", "+%2"),
                 row("Stability (R²)", "stability", "2"),
                 row("Profit factor (omega ratio)", "omega", "2"),
-                row("Gain-to-pain ratio, monthly", "gain_to_pain", "2"),
+                row(
+                    f"Gain-to-pain ratio, {every if per_year <= 13 else 'monthly'}",
+                    "gain_to_pain",
+                    "2",
+                ),
                 row("Tail ratio", "tail_ratio", "2"),
                 row("Payoff (mean gain over mean loss)", "payoff", "2"),
                 row("Kelly fraction", "kelly", "2"),
@@ -151,12 +164,11 @@ def _written(value: float, form: str) -> str:
 def _drawdowns(series: StrategySeries, data: BacktestData) -> list[list[str]]:
     """The deepest drawdowns; of several seeds, those of their mean return."""
     days = data.dates
-    before = min(np.timedelta64(1, "D"), *np.diff(days[:2]))
 
     def spelled(place: int | None) -> str:
         if place is None:
             return "not yet"
-        return spell(days[0] - before if place < 0 else days[place], days)
+        return spell(data.trades[0] if place < 0 else days[place], days)
 
     unit = unit_of(data.assessment.periods_per_year)
     return [
@@ -178,8 +190,13 @@ def _edges(returns: list[Floats]) -> Floats:
     return np.linspace(-reach, reach, BINS + 1)
 
 
-def _histogram(returns: Floats, reference: Floats, edges: Floats) -> dict[str, Any]:
-    """Bars of the returns and the outline of the reference's, in percent of the highest."""
+def _histogram(
+    returns: Floats, reference: Floats, edges: Floats, found: dict[str, float]
+) -> dict[str, Any]:
+    """Bars of the returns and the outline of the reference's, in percent of the highest.
+
+    found: the figures of the strategy, among them its value at risk.
+    """
 
     def shares(values: Floats) -> Floats:
         counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
@@ -195,7 +212,7 @@ def _histogram(returns: Floats, reference: Floats, edges: Floats) -> dict[str, A
     ]
     reach = float(edges[-1])
     at = partial(place, low=-reach, high=reach)
-    var, cvar = value_at_risk(returns)
+    var, cvar = found["var"], found["cvar"]
     return {
         "bars": [
             (round(i * width, 3), round(100 * height / highest, 2))

@@ -51,12 +51,15 @@ def test_components_are_of_training_rows():
     np.testing.assert_allclose(got, np.sign(got @ expected) * expected, atol=1e-12)
 
 
-def test_interest_on_cash_is_no_alpha(prices, stretches):
+@pytest.mark.parametrize("carry", [0.0, 0.03])
+def test_interest_on_cash_and_dividends_are_no_alpha(prices, stretches, carry):
     """An agent that holds half of its wealth in cash, which earns 5% a year."""
     folds, rate = [fold for *_, fold in stretches], np.full(600, 0.05 / 252)
-    market = factor_returns(prices.values, folds, 1, 252)["market"]
-    found = factor_returns(prices.values, folds, 1, 252, cash=rate)
-    np.testing.assert_allclose(found["market"], market - rate)
+    market = factor_returns(prices.values, folds, 1, 252)["market"] + carry / 252
+    relatives = prices.values[200:800] / prices.values[199:799]
+    growth = np.column_stack([1 + rate, relatives + carry / 252])
+    found = factor_returns(prices.values, folds, 1, 252, growth=growth)
+    np.testing.assert_allclose(found["market"], market - rate, atol=1e-12)
     noise = np.random.default_rng(0).normal(0, 1e-5, 600)
     left = exposures((market + rate) / 2 + noise - market, {"market": found["market"]}, 252)
     assert left is not None

@@ -33,8 +33,9 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
     """Explain every agent of a finished backtest, from the replays of ``Backtest.entries``."""
     prices, config = backtest.prices, backtest.config
     year = prices.periods_per_year
-    cash = backtest.replay.growth[:, 0] - 1
-    factors = factor_returns(prices.values, backtest.folds, config.lag, year, prices.tradable, cash)
+    factors = factor_returns(
+        prices.values, backtest.folds, config.lag, year, prices.tradable, backtest.replay.growth
+    )
     one = lambda name: _explained(name, backtest, entries, factors)  # noqa: E731
     with ThreadPoolExecutor(backtest.side_by_side) as threads:
         found = list(threads.map(one, backtest.agents))

@@ -80,7 +80,7 @@ def factor_returns(
     lag: int,
     periods_per_year: float,
     tradable: Bools | None = None,
-    cash: Floats | float = 0.0,
+    growth: Floats | None = None,
 ) -> dict[str, Floats]:
     """The returns of every factor on the days of a test.
 
@@ -91,7 +91,8 @@ def factor_returns(
         periods_per_year: Sets the number of rows in a year, a month and a week.
         tradable: Whether a factor may hold an asset from a row to the next, of the same shape as
             the prices (default: from its first price on).
-        cash: What cash earns on the days of the test, shape (D,) (default: nothing).
+        growth: Growth factors of cash and each asset on the days of the test, shape (D, 1 + N):
+            interest and carry included (default: those of the prices, and 1 for cash).
 
     Returns:
         Series of shape (D,), by the name of the factor.
@@ -103,6 +104,10 @@ def factor_returns(
     moves[1:] = np.where(held[1:], values[1:] / values[:-1] - 1, 0)
     shift = lag + 1
     days = slice(folds[0].decisions.start + shift, folds[-1].decisions.stop + shift)
+    cash: Floats | float = 0.0
+    if growth is not None:
+        cash = growth[:, 0] - 1
+        moves[days] = np.where(held[days], growth[:, 1:] - 1, 0)
     market = moves.sum(1) / np.maximum(held.sum(1), 1)
     found = {"market": market[days] - cash}
     for name, signal in _signals(periods_per_year).items():
