@@ -78,6 +78,20 @@ def test_signals_are_ordered_by_their_worth(explained):
     assert section["signals"][1]["term"] is None
 
 
+@pytest.mark.parametrize("ignored", [False, True])
+def test_signals_that_change_nothing_are_folded_up(explained, ignored):
+    agents = explained.why.agents
+    agent = agents["DQN-together"]
+    agent = replace_in(agent, importance=replace_in(agent.importance, ignored=ignored))
+    why = replace_in(explained.why, agents={**agents, "DQN-together": agent})
+    page = render_backtest(replace(explained, why=why))
+    folded = "<summary>Figures of each signal, and slices of the policy</summary>"
+    assert (folded in page) == ignored
+    said = "No signal changes what it decides, so no rule of signals describes it."
+    assert page.count(said) == ignored
+    assert page.count("<details") == page.count("</details>")
+
+
 def test_small_parts_have_more_digits(explained):
     parts = made_up_why().agents["DQN-together"].decomposition
     small = type(parts)(0.1315, 0.131, 0.001, 0.0001, 0.1, 0.0006, [], [])

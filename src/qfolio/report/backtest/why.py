@@ -42,6 +42,7 @@ def why_sections(data: BacktestData) -> list[dict[str, Any]]:
             "assets": _assets(why.decomposition),
             "others": len(why.decomposition.assets) > LISTED + 2,
             "exposures": _exposures(why.exposures, data.why.reference),
+            "ignored": why.importance.ignored,
             "signals": _signals(why),
             "told": _told(why),
             "slices": _panels(why.slices),

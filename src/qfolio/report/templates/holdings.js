@@ -92,7 +92,7 @@
   function read(index) {
     const series = all[chosen], order = rows(series);
     const [head, ...cells] = byId("weights-list").querySelectorAll(".now");
-    head.textContent = dates[index];
+    head.textContent = `weight, ${dates[index]}`;
     cells.forEach((cell, i) => { cell.textContent = percent(series.values[order[i]][index]); });
   }
 
