@@ -26,6 +26,7 @@ from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
+from populations import first_member, train_to
 from probes import Aim, AimNumbered, AimPlainWeights, AimWeights, OneState
 
 DISCOUNT = 0.8
@@ -41,10 +42,7 @@ SMALL: dict[str, Any] = {
 
 def learned(task, agent, steps=2000):
     agent = eqx.tree_at(lambda a: a.learning_rate_steps, agent, float(steps))
-    population = Population(task, agent, [0])
-    while population.steps < steps:
-        population.advance(steps - population.steps)
-    return jax.tree.map(lambda x: jnp.asarray(x[0]), population.fetch().agent.learned)
+    return first_member(train_to(Population(task, agent, [0]), steps).fetch().agent.learned)
 
 
 def begun(agent, bound=2.0, seed=3):

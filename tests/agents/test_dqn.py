@@ -43,6 +43,8 @@ from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.gymnasium import GymnasiumTask
 from qfolio.tasks.pendulum import Pendulum
 
+from populations import assert_same, train_to
+
 VALUES, ROOTS = Scale(roots=False), Scale(roots=True)
 
 structure: Any = jax.tree.structure  # the type of what it gives declares no ==
@@ -126,7 +128,7 @@ def largest(gradient):
 def test_observing_learns_nothing(task, agent):
     state = jit(agent.init)(task, jax.random.key(0))
     after = jit(agent.observe)(state, rollout(agent))
-    jax.tree.map(np.testing.assert_array_equal, after.online, state.online)
+    assert_same(after.online, state.online)
     assert after.replay.size == agent.num_envs
 
 
@@ -207,9 +209,7 @@ def test_the_report_presets_copies_come_at_the_end_of_each_episode():
     population = Population(task, agent, [0])
     copied = []
     for step in (63, 199, 200, 201, 399, 400):
-        while population.steps < step:
-            population.advance(step - population.steps)
-        state = population.fetch().agent
+        state = train_to(population, step).fetch().agent
         copied.append(bool((first_layer(state.target) == first_layer(state.online)).all()))
     assert copied == [True, False, True, False, False, True]
 
@@ -656,4 +656,4 @@ def test_priorities_are_part_of_what_is_saved(task, agent, tmp_path):
     write_tree(tmp_path / "state", state)
     again = read_tree(tmp_path / "state", fresh)
     assert again.replay.priorities.levels[-1].sum() == agent.num_envs
-    jax.tree.map(np.testing.assert_array_equal, again, state)
+    assert_same(again, state)

@@ -15,6 +15,8 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
+from populations import train_to
+
 SMALL: dict[str, Any] = {
     "num_envs": 8,
     "rollout_length": 42,
@@ -33,9 +35,8 @@ def prices(moves):
 def trained(*tables, task=None, rounds=40, agent=MinimumVariance, **settings):
     """The tasks of some tables, and the states of agents trained on them."""
     tasks = [Portfolio.of(prices(moves), **TASK, **(task or {})) for moves in tables]
-    population = Population(tasks, agent(**{**SMALL, **settings}), list(range(len(tables))))
-    while population.steps < rounds * SMALL["rollout_length"]:
-        population.advance(SMALL["rollout_length"] * rounds - population.steps)
+    population = Population(tasks, agent(**{**SMALL, **settings}), range(len(tables)))
+    train_to(population, rounds * SMALL["rollout_length"])
     states = jax.tree.map(jnp.asarray, population.fetch().agent)
     pick = lambda i: jax.tree.map(lambda x: x[i], states)  # noqa: E731
     return tasks, [pick(i) for i in range(len(tables))]

@@ -20,6 +20,7 @@ from qfolio.learning.targets import unsquash
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
+from populations import first_member, train_to
 from probes import Aim
 
 SMALL: dict[str, Any] = {
@@ -221,10 +222,7 @@ def test_learns_values_from_imagined_steps():
     """The probe that test_actor_critic.py explains, with few real steps."""
     steps = 800
     agent = MBPO(**SMALL, learning_rate_steps=2.0 * steps)
-    population = Population(Aim(), agent, [0])
-    while population.steps < steps:
-        population.advance(steps - population.steps)
-    state = jax.tree.map(lambda x: jnp.array(x[0]), population.fetch().agent)
+    state = first_member(train_to(Population(Aim(), agent, [0]), steps).fetch().agent)
     states, best = jnp.array([[0.5], [-0.5]]), jnp.array([[1.0], [-1.0]])
     np.testing.assert_allclose(agent.policy(agent.weights(state), states), best, atol=0.05)
     change, root, terminal = jnp.split(state.model(states, best).mean(0), [1, 2], 1)

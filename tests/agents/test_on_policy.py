@@ -27,6 +27,7 @@ from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
 from planted import planted
+from populations import first_member, train_to
 from probes import Aim, AimPlainWeights, AimWeights, Endless, OneState, RewardDelay, TwoStates
 
 DISCOUNT = 0.9
@@ -376,11 +377,8 @@ def learned(agent, task, steps=4000, **changes):
     }  # fmt: skip
     if agent is PPO:
         settings |= {"batch_size": 32, "epochs": 4, "learning_rate_steps": 2 * steps}
-    agent = agent(**{**settings, **changes})
-    population = Population(task, agent, [0])
-    while population.steps < steps:
-        population.advance(steps - population.steps)
-    return jax.tree.map(lambda x: jnp.asarray(x[0]), population.weights())
+    population = Population(task, agent(**{**settings, **changes}), [0])
+    return first_member(train_to(population, steps).weights())
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from qfolio.tasks.finite import Cliff, FiniteMDP, FrozenLake, Garnet
 from qfolio.tasks.grid_pendulum import GridPendulum
 from qfolio.tasks.pendulum import Pendulum
 
+from populations import first_member, train_to
 from shell import qfolio
 
 KINDS = [QLearning, Sarsa, ExpectedSarsa, DoubleQ, DynaQ]
@@ -57,9 +58,7 @@ def test_states_beyond_the_last_are_refused(kind):
 
 def trained(task, agent, steps, seeds=(100,)):
     """Learned action values (seed, state, action)."""
-    population = Population(task, agent, seeds)
-    while population.steps < steps:
-        population.advance(steps - population.steps)
+    population = train_to(Population(task, agent, seeds), steps)
     states = jnp.arange(task.states)
     return np.array(
         [agent.action_values(jnp.asarray(table), states) for table in population.weights()]
@@ -376,10 +375,7 @@ def test_a_network_learns_on_numbered_states():
         discount=DISCOUNT, target_update_interval=1, tau=0.05, learning_rate=3e-3,
         learning_rate_steps=1500.0, learning_rate_final=0.0, epsilon_end=0.5,
     )  # fmt: skip
-    population = Population(task, agent, [0])
-    while population.steps < 1500:
-        population.advance(1500 - population.steps)
-    weights = jax.tree.map(lambda x: jnp.array(x[0]), population.weights())
+    weights = first_member(train_to(Population(task, agent, [0]), 1500).weights())
     values = agent.action_values(weights, jnp.arange(2))
     assert values is not None
     exact = task.optimum().action_values(DISCOUNT)[:2]

@@ -22,6 +22,8 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
+from populations import first_member, train_to
+
 SMALL: dict[str, Any] = {
     "num_envs": 16,
     "rollout_length": 42,
@@ -138,9 +140,8 @@ def test_no_evidence_of_nothing():
 
 def trained(*tables, rounds=40, signals=TASK["signals"], **settings):
     tasks = [Portfolio.of(prices(values), **{**TASK, "signals": signals}) for values in tables]
-    population = Population(tasks, Tilts(**SMALL, **settings), list(range(len(tables))))
-    while population.steps < rounds * SMALL["rollout_length"]:
-        population.advance(SMALL["rollout_length"] * rounds - population.steps)
+    population = Population(tasks, Tilts(**SMALL, **settings), range(len(tables)))
+    train_to(population, rounds * SMALL["rollout_length"])
     return jax.tree.map(jnp.asarray, population.fetch().agent)
 
 
@@ -178,7 +179,7 @@ def test_many_assets_learn_as_few_do(monkeypatch, network):
 def test_finds_momentum():
     rng = np.random.default_rng(1)
     drift = np.repeat(rng.normal(0, 0.004, (15, 8)), 100, axis=0)
-    state = jax.tree.map(lambda x: x[0], trained(walk(1500, 8, 2, drift)))
+    state = first_member(trained(walk(1500, 8, 2, drift)))
     assert state.evidence.t > 4
     assert state.policy.members.linear[:, 0].min() > 0.1
 

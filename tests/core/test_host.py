@@ -23,6 +23,7 @@ from qfolio.experiments.budget import Budget
 from qfolio.experiments.run import Run
 from qfolio.tasks.gymnasium import GymnasiumTask
 
+from populations import assert_same, first_member, stored, train_to
 from probes import RewardDelay
 from shell import qfolio
 
@@ -169,19 +170,7 @@ def task(kind, **options):
 
 
 def trained(task, agent, seeds, steps, kind=HostPopulation):
-    population = kind(task, agent, seeds)
-    while population.steps < steps:
-        population.advance(steps - population.steps)
-    return population
-
-
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
-def stored(population):
-    replay = population.fetch().agent.replay
-    return replay.unpack(jnp.array(replay.rows[0]))
+    return train_to(kind(task, agent, seeds), steps)
 
 
 def test_it_learns_what_the_compiled_loop_learns():
@@ -246,7 +235,7 @@ def test_bootstraps_through_the_time_limit():
         learning_rate_final=0.0, learning_rate_steps=1400.0, episode_steps=0,
     )  # fmt: skip
     weights = trained(task(Endless), agent, [0], 1500).weights()
-    values = agent.action_values(jax.tree.map(lambda x: jnp.array(x[0]), weights), jnp.ones((1, 2)))
+    values = agent.action_values(first_member(weights), jnp.ones((1, 2)))
     assert values is not None
     np.testing.assert_allclose(values, [[5.0, 5.0]], rtol=0.02)
 
@@ -256,12 +245,12 @@ def test_a_seed_is_one_result_alone_and_among_others():
     together = trained(task(Numbered), agent, range(3), 150)
     alone = trained(task(Numbered), agent, [1], 150)
     again = trained(task(Numbered), agent, [1], 150)
-    same(alone.fetch(), again.fetch())
-    same(alone.fetch(), jax.tree.map(lambda x: x[1:2], together.fetch()))
+    assert_same(alone.fetch(), again.fetch())
+    assert_same(alone.fetch(), jax.tree.map(lambda x: x[1:2], together.fetch()))
     rows = together.fetch().agent.replay.rows
     assert not np.array_equal(rows[0], rows[1])
     keys = start_keys(12)
-    same(together.evaluate(keys).returns[1:2], alone.evaluate(keys).returns)
+    assert_same(together.evaluate(keys).returns[1:2], alone.evaluate(keys).returns)
 
 
 def test_numbers_that_do_not_begin_at_zero():
@@ -300,7 +289,7 @@ def test_every_graded_episode_is_that_of_its_seed():
     many = population.evaluate(start_keys(23)).returns
     assert many.shape == (2, 23)
     for few in (1, 10, 12):
-        same(population.evaluate(start_keys(few)).returns, many[:, :few])
+        assert_same(population.evaluate(start_keys(few)).returns, many[:, :few])
 
 
 def test_it_goes_on_from_a_checkpoint_in_new_episodes(tmp_path):
@@ -312,7 +301,7 @@ def test_it_goes_on_from_a_checkpoint_in_new_episodes(tmp_path):
     assert run.population.fetch().tally.steps.tolist() == [[1, 1], [1, 1]]
     again = Run.open(tmp_path / "run")
     assert again.population.fetch().tally.steps.tolist() == [[0, 0], [0, 0]]
-    same(again.population.fetch().agent, run.population.fetch().agent)
+    assert_same(again.population.fetch().agent, run.population.fetch().agent)
     again.train(Budget(steps=60))
     assert again.done("steps") == 60
     assert again.config.steps == 60

@@ -13,6 +13,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin, chunk_steps
 
+from populations import assert_same, stored, train_to
 from probes import Endless, Explosive, RewardDelay
 
 
@@ -25,33 +26,22 @@ def trained(task, agent, seeds, steps):
     return population, records
 
 
-def stored(population):
-    """The first member's replay buffer."""
-    replay = population.fetch().agent.replay
-    return replay.unpack(jnp.array(replay.rows[0]))
-
-
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
 def test_a_seed_alone_equals_the_seed_among_others(task, agent):
     together, _ = trained(task, agent, range(5), [150])
     for seed in (0, 3):
         alone, _ = trained(task, agent, [seed], [150])
-        same(alone.fetch(), jax.tree.map(lambda x, s=seed: x[s : s + 1], together.fetch()))
+        assert_same(alone.fetch(), jax.tree.map(lambda x, s=seed: x[s : s + 1], together.fetch()))
 
 
 def test_members_of_another_number_share_programs(task, agent):
     """A smaller population that comes first leaves no member of a larger one out."""
     small, large = (Population(task, agent, range(count), room=5) for count in (1, 5))
     for population in (small, large):
-        while population.steps < 120:
-            population.advance(120 - population.steps)
+        train_to(population, 120)
     assert small._programs is large._programs
-    same(large.fetch(), trained(task, agent, range(5), [120])[0].fetch())
+    assert_same(large.fetch(), trained(task, agent, range(5), [120])[0].fetch())
     first = jax.tree.map(lambda leaf: leaf[:1], large.fetch())
-    same(small.fetch(), first)
+    assert_same(small.fetch(), first)
 
 
 def test_a_rehearsal_compiles_what_a_population_runs(task, agent):
@@ -64,7 +54,7 @@ def test_a_rehearsal_compiles_what_a_population_runs(task, agent):
     population, _ = trained(task, agent, range(3), [120])
     assert population._programs is rehearsal._programs
     assert population.seconds_compile == 0
-    same(population.fetch(), expected.fetch())
+    assert_same(population.fetch(), expected.fetch())
 
 
 @pytest.mark.parametrize(
@@ -98,7 +88,7 @@ def test_different_seeds_differ(task, agent):
 def test_pauses_change_nothing(task, agent):
     paused, _ = trained(task, agent, [0, 1], [3, 10, 11, 90, 150])
     straight, _ = trained(task, agent, [0, 1], [150])
-    same(paused.fetch(), straight.fetch())
+    assert_same(paused.fetch(), straight.fetch())
 
 
 def test_restoring_goes_on_bit_for_bit(task, agent):
@@ -107,7 +97,7 @@ def test_restoring_goes_on_bit_for_bit(task, agent):
     second.restore(first.fetch())
     straight, _ = trained(task, agent, [0, 1, 2], [150])
     second.advance(150 - 77)
-    same(second.fetch(), straight.fetch())
+    assert_same(second.fetch(), straight.fetch())
 
 
 def test_transitions_end_before_the_reset():
@@ -169,7 +159,7 @@ def test_warm_up_stores_and_does_not_learn(task, agent):
     after = population.fetch()
     assert after.steps == agent.warm_up() == 9
     assert after.agent.replay.size == 18
-    same(agent.weights(after.agent), before)
+    assert_same(agent.weights(after.agent), before)
 
 
 def test_steps_left_ends_with_whole_episodes(task, agent):

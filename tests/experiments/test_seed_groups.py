@@ -1,7 +1,6 @@
 """Runs whose seeds train in groups: the same as all of them side by side, to the bit."""
 
 import jax
-import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
@@ -13,6 +12,7 @@ from qfolio.experiments.run import Run, train
 
 from jobs import Elsewhere
 from listeners import Interrupt, Tell
+from populations import assert_same
 from shell import TINY, qfolio
 
 EPISODES, SEEDS = 12, 3
@@ -35,7 +35,7 @@ def logged(folder, kind):
 
 def same(first, second):
     """Whether two runs agree to the bit."""
-    jax.tree.map(np.testing.assert_array_equal, first.population.fetch(), second.population.fetch())
+    assert_same(first.population.fetch(), second.population.fetch())
     assert first.metrics == second.metrics
     assert first.evaluations == second.evaluations
     assert first.grade() == second.grade()

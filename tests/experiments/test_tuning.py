@@ -35,6 +35,7 @@ from qfolio.report.tuning import render_page, write_tuning_report
 from qfolio.tasks.catch import Catch
 
 from jobs import Elsewhere
+from populations import assert_same, train_to
 from shell import TINY, qfolio
 
 EPISODES = 4
@@ -55,14 +56,7 @@ def ask(work):
 
 
 def trained(task, agents, seeds, steps=60):
-    population = Population(task, agents, seeds)
-    while population.steps < steps:
-        population.advance(steps - population.steps, strict=False)
-    return population
-
-
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
+    return train_to(Population(task, agents, seeds), steps, strict=False)
 
 
 # The population
@@ -76,9 +70,9 @@ def test_members_with_numbers_of_their_own_equal_each_alone(task, agent):
     for index, one in enumerate((first, second)):
         alone = trained(task, one, [0, 1])
         pick = lambda x, i=index: x[i::2]  # noqa: E731
-        same(alone.fetch(), jax.tree.map(pick, together.fetch()))
+        assert_same(alone.fetch(), jax.tree.map(pick, together.fetch()))
         # The overestimation depends on the member's own discount.
-        same(alone.evaluate(tuning_keys(), tail=0), jax.tree.map(pick, greedy))
+        assert_same(alone.evaluate(tuning_keys(), tail=0), jax.tree.map(pick, greedy))
 
 
 def test_the_tail_is_that_of_the_longest_discount(task, agent):
@@ -99,7 +93,7 @@ def test_a_diverging_member_leaves_the_others_alone(task, agent):
     together = trained(task, [agent, wild, agent, wild], [0, 0, 1, 1])
     assert together.healthy == [True, False, True, False]
     alone = trained(task, agent, [0, 1])
-    same(alone.fetch(), jax.tree.map(lambda x: x[::2], together.fetch()))
+    assert_same(alone.fetch(), jax.tree.map(lambda x: x[::2], together.fetch()))
     with pytest.raises(QfolioError, match="no longer finite"):
         together.advance(10)
 

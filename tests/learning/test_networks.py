@@ -23,6 +23,7 @@ from qfolio.tasks.catch import Catch
 from qfolio.tasks.hidden_pendulum import HiddenPendulum
 from qfolio.tasks.pendulum import Pendulum
 
+from populations import first_member, train_to
 from probes import TERMINATED, TwoStates
 
 KEY = jax.random.key(3)
@@ -185,18 +186,11 @@ LEARNER: dict[str, Any] = {
 }  # fmt: skip
 
 
-def train(population, steps):
-    while population.steps < steps:
-        population.advance(steps - population.steps)
-    return population
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rnn", "lstm"])
 def test_an_agent_recalls_what_it_saw_first(kind):
     agent = DQN(**{**LEARNER, "network": kind, "hidden": (16,)})
-    population = train(Population(Recall(), agent, [100]), 800)
-    weights = jax.tree.map(lambda x: jnp.array(x[0]), population.weights())
+    weights = first_member(train_to(Population(Recall(), agent, [100]), 800).weights())
     seen = jax.vmap(Recall().observe)(jnp.array([1.0, -1.0]))
     values = agent.action_values(weights, seen)
     assert values is not None
@@ -210,7 +204,7 @@ def test_an_agent_learns_to_catch_what_it_sees():
            "replay_capacity": 16_384, "learning_starts": 1024, "discount": 0.97,
            "learning_rate": 1e-3, "learning_rate_steps": 1500.0, "epsilon_decay": 0.999},
     )  # fmt: skip
-    population = train(Population(Catch(), agent, [100, 101]), 1500)
+    population = train_to(Population(Catch(), agent, [100, 101]), 1500)
     np.testing.assert_array_equal(population.evaluate(start_keys(256), tail=0).returns, 1.0)
 
 

@@ -20,6 +20,7 @@ from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.finite import Cliff
 from qfolio.tasks.pendulum import Pendulum
 
+from populations import assert_same, first_member, train_to
 from probes import Aim
 
 BOTH: dict[str, Any] = {"normalize_observations": True, "normalize_rewards": True}
@@ -48,10 +49,7 @@ def moments(normalizer):
 
 
 def trained(task, agent, steps, seeds=(0,)):
-    population = Population(task, agent, seeds)
-    while population.steps < steps:
-        population.advance(steps - population.steps)
-    return population
+    return train_to(Population(task, agent, seeds), steps)
 
 
 @pytest.mark.parametrize("sizes", [[40], [1] * 40, [1, 9, 30]])
@@ -119,8 +117,8 @@ def test_an_evaluation_uses_the_statistics_and_leaves_them(agent):
     population = trained(Foreign(), agent, 40)
     before = population.fetch()
     population.evaluate(start_keys(20))
-    jax.tree.map(np.testing.assert_array_equal, before, population.fetch())
-    state = jax.tree.map(lambda x: jnp.asarray(x[0]), before.agent)
+    assert_same(before, population.fetch())
+    state = first_member(before.agent)
     seen = jnp.array([[290.0], [310.0], [1e6]])
     plain = type(agent)(hidden=(8,))
     inner = state.weights if isinstance(agent, PPO) else state.learned.actor
@@ -138,11 +136,9 @@ def test_a_run_resumes_with_its_statistics_bit_for_bit(agent, tmp_path):
     half = Run.create(task, agent, steps=80, seeds=2, out=tmp_path / "half")
     half.train()
     again = Run.open(tmp_path / "half")
-    jax.tree.map(
-        np.testing.assert_array_equal, half.population.weights(), again.population.weights()
-    )
+    assert_same(half.population.weights(), again.population.weights())
     again.train(whole.budget)
-    jax.tree.map(np.testing.assert_array_equal, whole.population.fetch(), again.population.fetch())
+    assert_same(whole.population.fetch(), again.population.fetch())
     assert (again.grade()["return_per_seed"]) == whole.grade()["return_per_seed"]
 
 
@@ -155,7 +151,7 @@ def test_units_do_not_matter():
     own, foreign = (trained(task, agent, 40) for task in (Aim(), Foreign()))
     states = jnp.array([[0.5], [-0.5]])
     actions = [
-        agent.policy(jax.tree.map(lambda x: jnp.asarray(x[0]), population.weights()), seen)
+        agent.policy(first_member(population.weights()), seen)
         for population, seen in ((own, states), (foreign, 300 + 20 * states))
     ]
     np.testing.assert_allclose(actions[0], actions[1], atol=1e-2)

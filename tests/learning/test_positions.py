@@ -15,6 +15,7 @@ from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.portfolio.task import Portfolio
 
 from planted import persistent
+from populations import train_to
 
 SIGNALS = [[1.0, 0.5], [0.0, -1.0], [-1.0, 0.5]]
 
@@ -138,9 +139,7 @@ def test_each_agent_finds_planted_momentum(name):
     decay = 600.0 if off_policy else 300.0
     agent = PRESETS["portfolio", name]["fast"].build(learning_rate_steps=decay)
     population = Population(planted(), agent, [0, 1, 2])
-    steps = 300 if off_policy else 2400
-    while population.steps < steps:
-        population.advance(steps - population.steps)
+    train_to(population, 300 if off_policy else 2400)
     leaves = jax.tree.leaves(population.weights(), is_leaf=lambda x: isinstance(x, Tilting))
     (network,) = [leaf for leaf in leaves if isinstance(leaf, Tilting)]
     momentum, volatility = np.asarray(network.linear).T

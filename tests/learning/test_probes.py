@@ -1,6 +1,5 @@
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ from equinox import filter_jit as jit
 from qfolio.agents.dqn import DQN
 from qfolio.core.population import Population
 
+from populations import first_member, train_to
 from probes import Endless, OneState, RewardDelay, TwoStates
 
 DISCOUNT = 0.9
@@ -46,10 +46,7 @@ def learned_values(task, observations, steps=1500, **changes):
         "epsilon_end": 0.2, "learning_rate_final": 0.0,
     }  # fmt: skip
     agent = DQN(**{**settings, **changes})
-    population = Population(task, agent, [0])
-    while population.steps < steps:
-        population.advance(steps - population.steps)
-    weights = jax.tree.map(lambda x: jnp.asarray(x[0]), agent.weights(population.fetch().agent))
+    weights = first_member(train_to(Population(task, agent, [0]), steps).weights())
     return np.asarray(jit(agent.action_values)(weights, jnp.array(observations)))
 
 

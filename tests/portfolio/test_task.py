@@ -19,6 +19,8 @@ from qfolio.portfolio.market import Menu, Signalled
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
+from populations import train_to
+
 ROWS, ASSETS, WINDOW = 60, 3, 5
 
 
@@ -159,10 +161,7 @@ QUICK = ("pathwise",)
 def trained(request):
     agent, menu = AGENTS[request.param]
     task = portfolio(menu=menu, signals="momentum:8-2,volatility:5").part(0, 40)
-    population = Population(task, agent, [0, 1])
-    while population.steps < 60:
-        population.advance(60)
-    return task, agent, population.weights()
+    return task, agent, train_to(Population(task, agent, [0, 1]), 60).weights()
 
 
 def test_no_agent_looks_ahead(trained):

@@ -32,6 +32,7 @@ from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 from qfolio.portfolio.universe import Patterns, spread
 
+from populations import assert_same
 from tables import all_findings
 from tiny import PATHWISE
 
@@ -220,7 +221,7 @@ def test_what_comes_and_goes_later_changes_nothing_before(seed: int, mandate: An
     )
     for row in range(6, now + 1):
         seen = [jax.tree.map(np.asarray, view(task, jnp.array(row))) for task in (one, two)]
-        jax.tree.map(np.testing.assert_array_equal, *seen)
+        assert_same(*seen)
         there = prices.tradable[row]  # type: ignore[index]
         assert (seen[0][1][1:][~there] == 0).all()
         assert (seen[0][0].anchor[~there] == 0).all()

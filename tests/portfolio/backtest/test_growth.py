@@ -14,6 +14,8 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.prices.growth import require_grown
 from qfolio.portfolio.prices.table import Prices
 
+from populations import assert_same
+
 ROWS, FIRST = 160, 130  # folds of 30 rows begin at 60, 90, 120 and 150; the third has 10 at first
 SETTINGS = {"rollout_length": 5, "num_envs": 2, "hidden": (4,)}
 AGENT = Preset("pathwise", SETTINGS, episodes=4, seeds=1, task={"window": 5, "horizon": 10})
@@ -51,11 +53,6 @@ def policies(run):
 def returns(run):
     entries, _ = run.entries()
     return {name: entry.simulation.returns for name, entry in entries.items()}
-
-
-def assert_same(one, other):
-    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_array_equal(x, y)
 
 
 def test_going_on_equals_one_run_and_keeps_what_was_there(first, tmp_path):
