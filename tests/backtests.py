@@ -17,6 +17,8 @@ from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
 from qfolio.portfolio.backtest.statistics.assessment import Strategy, assess
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 
+from tables import weekdays
+
 ATTACK = "</script><script>hacked = 1</script><img src=x onerror='hacked = 1'>"
 LINK = "<a href=\"javascript:hacked = 1\">%{x}</a> & 'quotes' $x^2$"
 
@@ -84,10 +86,6 @@ def make_data(
     return replace(data, **more)
 
 
-def weekdays(start: str, count: int) -> np.ndarray:
-    return np.busday_offset(start, np.arange(count), roll="forward").astype("datetime64[s]")
-
-
 def usual(days: int = 300, seeds: int = 3, **more: Any) -> BacktestData:
     rng = np.random.default_rng(3)
     series = {
@@ -100,7 +98,7 @@ def usual(days: int = 300, seeds: int = 3, **more: Any) -> BacktestData:
         "DQN-together": make_series(rng, "ensemble", 1, days, 4, 0.0005),
         "pathwise": make_series(rng, "agent", seeds, days, 4, 0.02),
     }
-    return make_data(series, weekdays("2001-01-02", days), ("A", "B", "C", "D"), **more)
+    return make_data(series, weekdays(days, "2001-01-02"), ("A", "B", "C", "D"), **more)
 
 
 def of_returns_alone() -> BacktestData:

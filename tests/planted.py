@@ -11,6 +11,8 @@ from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
+from tables import days, price_table
+
 ASSETS = 6
 SIGNALS = "momentum:20,reversal:3,market-volatility:20"
 NAMES = ["log return", *SIGNALS.split(",")]
@@ -61,8 +63,7 @@ def planted(rows=800, seed=2):
         ranks = 2 * went.argsort().argsort() / (ASSETS - 1) - 1
         calm = 0.007 if t // 60 % 2 else 0.015
         logs[t] = logs[t - 1] + 0.003 * ranks + calm * rng.normal(size=ASSETS)
-    dates = np.datetime64("2001-01-01") + np.arange(rows, dtype="m8[D]")
-    return Prices(dates, tuple("ABCDEF"), np.exp(logs))
+    return price_table(np.exp(logs), dates=days(rows, "2001-01-01"))
 
 
 def with_a_delisted_asset(prices, rows=100):
@@ -83,8 +84,7 @@ def persistent(rows=700, assets=6, seed=0, market=0.0):
     for row in range(1, rows):
         drift[row] = 0.95 * drift[row - 1] + rng.normal(0, 0.001, assets)
     moves = drift + rng.normal(0, 0.005, drift.shape) + market * rng.normal(size=(rows, 1))
-    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
-    return Prices(dates, tuple("abcdef"[:assets]), 50 * np.exp(moves.cumsum(0)))
+    return price_table(50 * np.exp(moves.cumsum(0)), "abcdef")
 
 
 def four_folds(prices, **changed):

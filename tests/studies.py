@@ -7,7 +7,7 @@ from qfolio.portfolio.study.folder import Look, Result, StudyConfig, TableConfig
 from qfolio.portfolio.study.pooling import TableReturns
 from qfolio.portfolio.study.run import summarize
 
-from backtests import weekdays
+from tables import weekdays
 
 
 def made_up(rng: np.random.Generator, days: int, edge: float, start: str) -> TableReturns:
@@ -18,7 +18,7 @@ def made_up(rng: np.random.Generator, days: int, edge: float, start: str) -> Tab
         return market + drift + 0.002 * rng.standard_normal(days)
 
     return TableReturns(
-        tuple(map(str, weekdays(start, days).astype("datetime64[D]"))),
+        tuple(map(str, weekdays(days, start).astype("datetime64[D]"))),
         252.0,
         {"tilts": near(edge), "pathwise": near(0.0)},
         {"equal-weight": market, "equal-weight at 0": near(-1e-5)},

@@ -1,6 +1,5 @@
 """What README and docs/guides/own_parts.md show is executed, with less to compute."""
 
-import csv
 import json
 import re
 import shlex
@@ -8,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -16,6 +14,7 @@ from qfolio.portfolio.desk.holdings import read_holdings
 from qfolio.portfolio.prices.table import load
 
 from shell import qfolio
+from tables import write_table
 
 ROOT = Path(__file__).parents[1]
 
@@ -38,14 +37,7 @@ def changed(text, **changes):
 def prices(tmp_path, monkeypatch):
     """A table of prices in the current directory."""
     monkeypatch.chdir(tmp_path)
-    relatives = np.random.default_rng(0).normal(3e-4, 0.01, (400, 3))
-    days = np.datetime64("2020-01-01") + np.arange(400, dtype="m8[D]")
-    with open("prices.csv", "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["date", "AAPL", "B", "C"])
-        rows = (50 * np.exp(relatives.cumsum(0))).tolist()
-        writer.writerows([day, *row] for day, row in zip(days, rows, strict=True))
-    return relatives
+    write_table(tmp_path / "prices.csv", 400, ("AAPL", "B", "C"))
 
 
 @pytest.fixture
@@ -158,8 +150,8 @@ SMALLER = {
 
 @pytest.mark.slow
 def test_the_examples_of_the_readme(prices, tmp_path):
-    dates = pd.date_range("2020-01-01", periods=len(prices), freq="B")
-    returns = pd.DataFrame(np.expm1(prices), index=dates, columns=["AAPL", "B", "C"])
+    table = pd.read_csv("prices.csv", index_col="date")
+    returns = table.set_axis(pd.bdate_range("2020-01-01", periods=400)).pct_change().dropna()
     examples = [code for _, code in blocks("README.md", "python")]
     assert len(examples) >= 3
     text = "\n".join(examples)

@@ -14,17 +14,15 @@ from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.prices.table import Prices
 
+from tables import featured_table
+
 ROWS, WINDOW, HORIZON = 60, 5, 12
 CASH = [1.0, -1, -1, -1]
 CAPPED = {"assets": {"cap": 0.5}, "cash": {"max": 0.2}}
 
 
-def table(seed=0, rows=ROWS, features=0):
-    rng = np.random.default_rng(seed)
-    values = np.exp(np.cumsum(rng.normal(0, 0.02, (rows, 3)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
-    names = tuple(f"f{i}" for i in range(features))
-    return Prices(dates, ("a", "b", "c"), values, rng.normal(size=(rows, 3, features)), names)
+def table(rows=ROWS, features=0):
+    return featured_table(rows, features)
 
 
 def environment(prices=None, **task):

@@ -11,11 +11,11 @@ import pytest
 from qfolio.agents.mean_variance import MeanVariance, MinimumVariance
 from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
 from populations import train_to
+from tables import price_table
 
 SMALL: dict[str, Any] = {
     "num_envs": 8,
@@ -27,9 +27,7 @@ TASK: dict[str, Any] = {"window": 126, "horizon": 42, "anchor": "equal-weight"}
 
 
 def prices(moves):
-    values = np.exp(np.cumsum(moves, 0))
-    dates = np.datetime64("2000-01-03", "s") + np.arange(len(values)) * np.timedelta64(86400, "s")
-    return Prices(dates, tuple(f"a{i}" for i in range(values.shape[1])), values)
+    return price_table(np.exp(np.cumsum(moves, 0)))
 
 
 def trained(*tables, task=None, rounds=40, agent=MinimumVariance, **settings):

@@ -18,11 +18,11 @@ from qfolio.core.population import Population, programs_of
 from qfolio.learning.evidence import Evidence, left_out
 from qfolio.learning.scores import Hidden
 from qfolio.learning.trading import Trading
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
 from populations import first_member, train_to
+from tables import price_table, random_walk
 
 SMALL: dict[str, Any] = {
     "num_envs": 16,
@@ -36,11 +36,6 @@ TASK: dict[str, Any] = {
     "signals": "momentum:21,volatility:21",
     "anchor": "equal-weight",
 }
-
-
-def prices(values):
-    dates = np.datetime64("2000-01-03", "s") + np.arange(len(values)) * np.timedelta64(86400, "s")
-    return Prices(dates, tuple(f"a{i}" for i in range(values.shape[1])), values)
 
 
 def tilt(linear, interaction=None, rate=0.0, band=-20.0, cap=1.0):
@@ -139,19 +134,15 @@ def test_no_evidence_of_nothing():
 
 
 def trained(*tables, rounds=40, signals=TASK["signals"], **settings):
-    tasks = [Portfolio.of(prices(values), **{**TASK, "signals": signals}) for values in tables]
+    tasks = [Portfolio.of(price_table(values), **{**TASK, "signals": signals}) for values in tables]
     population = Population(tasks, Tilts(**SMALL, **settings), range(len(tables)))
     train_to(population, rounds * SMALL["rollout_length"])
     return jax.tree.map(jnp.asarray, population.fetch().agent)
 
 
-def walk(rows, assets, seed, drift=0.0):
-    return np.exp(np.cumsum(np.random.default_rng(seed).normal(0, 0.01, (rows, assets)) + drift, 0))
-
-
 @pytest.mark.parametrize("network", ["linear", "hidden"])
 def test_stays_at_the_anchor_where_prices_hold_nothing(network):
-    states = trained(*(walk(1500, 8, seed) for seed in range(3)), network=network)
+    states = trained(*(random_walk(1500, 8, seed) for seed in range(3)), network=network)
     assert states.evidence.steps.min() > 0
     at_anchor = states.policy.share == 0
     if states.policy.members.deep is not None:
@@ -163,7 +154,7 @@ def test_stays_at_the_anchor_where_prices_hold_nothing(network):
 @pytest.mark.parametrize("network", ["linear", "hidden"])
 def test_many_assets_learn_as_few_do(monkeypatch, network):
     """A step at a time and a path at a time, as with many assets, or all of them at once."""
-    table = walk(300, 3, seed=3)
+    table = random_walk(300, 3, seed=3)
     found = [trained(table, rounds=2, network=network).policy]
     for module in (paths, tilts):
         monkeypatch.setattr(module, "AT_ONCE", 0)
@@ -179,7 +170,7 @@ def test_many_assets_learn_as_few_do(monkeypatch, network):
 def test_finds_momentum():
     rng = np.random.default_rng(1)
     drift = np.repeat(rng.normal(0, 0.004, (15, 8)), 100, axis=0)
-    state = first_member(trained(walk(1500, 8, 2, drift)))
+    state = first_member(trained(random_walk(1500, 8, 2, drift)))
     assert state.evidence.t > 4
     assert state.policy.members.linear[:, 0].min() > 0.1
 
@@ -206,7 +197,7 @@ def test_a_network_finds_what_linear_scores_cannot(network):
 
 
 def test_a_network_changes_nothing_in_what_is_learned_without_it():
-    tables = [walk(1500, 8, seed) for seed in range(3)]
+    tables = [random_walk(1500, 8, seed) for seed in range(3)]
     # Few rounds: the two programs round differently, which training amplifies.
     deep, linear = (trained(*tables, rounds=10, network=name) for name in ("hidden", "linear"))
     np.testing.assert_allclose(deep.evidence.total, linear.evidence.total, rtol=1e-2, atol=1e-5)
@@ -216,7 +207,7 @@ def test_a_network_changes_nothing_in_what_is_learned_without_it():
 
 
 def test_a_network_learns_from_every_fourth_path():
-    state = trained(walk(300, 3, seed=3), rounds=2)
+    state = trained(random_walk(300, 3, seed=3), rounds=2)
     counted = state.evidence_of_depth.steps.sum() / state.evidence.steps.sum()
     np.testing.assert_allclose(counted, 1 / 4, rtol=1e-5)
 
@@ -256,7 +247,7 @@ def test_the_anchor_is_rebalanced_faster_where_losers_recover(network):
 
 
 def test_needs_an_anchor():
-    task = Portfolio.of(prices(walk(300, 3, 0)), **{**TASK, "anchor": ""})
+    task = Portfolio.of(price_table(random_walk(300, 3, 0)), **{**TASK, "anchor": ""})
     with pytest.raises(QfolioError, match="anchor=equal-weight"):
         Tilts(**SMALL).init(task, jax.random.key(0))
     with pytest.raises(QfolioError, match="has none"):
@@ -264,7 +255,7 @@ def test_needs_an_anchor():
 
 
 def test_a_rollout_must_not_span_two_episodes():
-    task = Portfolio.of(prices(walk(300, 3, 0)), **{**TASK, "horizon": 50})
+    task = Portfolio.of(price_table(random_walk(300, 3, 0)), **{**TASK, "horizon": 50})
     with pytest.raises(QfolioError, match=r"must divide the 50 steps .*, such as 25\."):
         Tilts(**SMALL).init(task, jax.random.key(0))
 

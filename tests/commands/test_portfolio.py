@@ -16,7 +16,7 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.report.backtest.finish import finish
 
 from shell import qfolio
-from tables import write_table
+from tables import days, write_table
 
 
 def test_backtest_writes_the_whole_folder(folder):
@@ -95,11 +95,11 @@ def test_a_backtest_goes_on_and_its_ledger_is_still_reproduced(
 def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     write_table(tmp_path / "prices.csv")
-    days = (np.datetime64("2020-01-01") + np.arange(260, dtype="m8[D]")).astype(str)
-    index = ["date,level", *(f"{day},{100 + i % 7}" for i, day in enumerate(days))]
+    dates = days(260).astype(str)
+    index = ["date,level", *(f"{day},{100 + i % 7}" for i, day in enumerate(dates))]
     (tmp_path / "world.csv").write_text("\n".join(index))
     (tmp_path / "mine.csv").write_text("date,A,cash\n2020-06-01,0.5,0.5\n")
-    returns = ["date,return", *(f"{day},0.001" for day in days)]
+    returns = ["date,return", *(f"{day},0.001" for day in dates)]
     (tmp_path / "fund.csv").write_text("\n".join(returns))
     own = ["--strategy", "mine=mine.csv", "--strategy", "fund=fund.csv"]
     tiny = ["--set", "window=10", "horizon=20", "hidden=4", "num_envs=2", "rollout_length=10"]

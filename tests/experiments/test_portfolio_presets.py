@@ -2,14 +2,14 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from qfolio.core import settings
 from qfolio.core.mdp import Discrete, Simplex
 from qfolio.experiments.presets import PRESETS
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
+
+from tables import price_table, random_walk
 
 NAMES = [(agent, name) for (on, agent), of in PRESETS.items() if on == "portfolio" for name in of]
 
@@ -21,12 +21,8 @@ def test_every_kind_of_agent_has_one():
 
 @pytest.mark.parametrize(("agent_name", "name"), NAMES)
 def test_its_actions_are_those_of_the_task(agent_name, name):
-    values = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (600, 3)).cumsum(0))
-    prices = Prices(
-        np.datetime64("2020-01-01") + np.arange(600, dtype="m8[D]"), ("a", "b", "c"), values
-    )
     preset = PRESETS["portfolio", agent_name][name]
-    task = Portfolio.of(prices, **settings.convert(Portfolio, preset.task))
+    task = Portfolio.of(price_table(random_walk(600)), **settings.convert(Portfolio, preset.task))
     agent = preset.build()
     assert preset.episodes % agent.num_envs == 0
     assert isinstance(task.actions, Discrete if agent_name == "dqn" else Simplex)

@@ -8,21 +8,20 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES
 from qfolio.portfolio import anchors
 from qfolio.portfolio.backtest.baselines import Baseline
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import LEAST, Portfolio
+
+from tables import price_table, random_walk
 
 ROWS = 320
 
 
 def table(rows=ROWS, features=None, late=False):
-    rng = np.random.default_rng(0)
-    values = 100 * np.exp(np.cumsum(rng.normal(0, 0.01, (ROWS, 4)) * [1, 2, 1, 3], 0))
+    values = random_walk(rows, 4, volatility=0.01 * np.array([1, 2, 1, 3]))
     if late:
         values[:60, 3] = np.nan
-    dates = np.datetime64("2020-01-01") + np.arange(ROWS, dtype="m8[D]")
     if features is None:
-        return Prices(dates[:rows], tuple("abcd"), values[:rows])
-    return Prices(dates[:rows], tuple("abcd"), values[:rows], features[..., None], ("weight",))
+        return price_table(values)
+    return price_table(values, features=features[..., None], feature_names=("weight",))
 
 
 @pytest.mark.parametrize("name", BASELINES)

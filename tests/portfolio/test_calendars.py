@@ -18,6 +18,7 @@ from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
+from tables import price_table, random_walk, weekdays
 from tiny import PATHWISE
 
 DAYS = np.array(
@@ -28,10 +29,7 @@ DAYS = np.array(
 
 
 def table(rows: int = 700) -> Prices:
-    rng = np.random.default_rng(0)
-    days = np.busday_offset("2019-01-01", np.arange(rows), roll="forward")
-    values = 50 * np.exp(np.cumsum(0.01 * rng.normal(size=(rows, 4)), 0))
-    return Prices(days.astype("datetime64[s]"), tuple("ABCD"), values)
+    return price_table(random_walk(rows, 4), dates=weekdays(rows, "2019-01-01"))
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,9 @@ from qfolio.portfolio.costs import (
     traded,
     with_cash,
 )
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
+
+from tables import price_table, random_walk
 
 COSTS = (0.0, 0.0001, 0.001, 0.0025, 0.01, 0.05, 0.2)
 
@@ -240,10 +241,10 @@ class WithInterest(CostModel):
 @pytest.mark.parametrize("lag", [0, 1, 3])
 def test_training_and_replay_charge_what_a_model_of_ones_own_says(lag: int) -> None:
     """By hand: shares keep their number, cash earns, and who waits for a trade earns on."""
-    values = np.exp(np.cumsum(np.random.default_rng(0).normal(0, 0.02, (30, 2)), axis=0))
-    prices = Prices(np.datetime64("2020-01-01") + np.arange(30, dtype="m8[D]"), ("a", "b"), values)
+    values = random_walk(30, 2, volatility=0.02)
+    model = f"{__name__}:WithInterest"
     task = Portfolio.of(
-        prices, window=5, horizon=10, lag=lag, cost=0.01, cost_model=f"{__name__}:WithInterest"
+        price_table(values), window=5, horizon=10, lag=lag, cost=0.01, cost_model=model
     )
     assert task.costs == WithInterest(cost=0.01)
     state = Position(task.first_decision, task.hold(jnp.array([1.0, 0, 0])))
@@ -308,8 +309,7 @@ class Wrong(WithInterest):
     ],
 )
 def test_a_model_of_ones_own_is_tried(mistake, says, monkeypatch):
-    dates = np.datetime64("2020-01-01") + np.arange(30, dtype="m8[D]")
-    prices = Prices(dates, ("a", "b", "c"), np.exp(np.random.default_rng(0).normal(size=(30, 3))))
+    prices = price_table(random_walk(30))
     monkeypatch.setattr(Wrong, "mistake", mistake)
     with pytest.raises(QfolioError, match=says):
         Portfolio.of(prices, window=5, horizon=10, cost_model=f"{__name__}:Wrong")

@@ -18,15 +18,16 @@ from qfolio.portfolio.market import Holding
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
+from tables import price_table, random_walk
+
 ASSETS = ("a", "b", "c")
 FIRST, LAST = 40, 790
 
 
 def table(seed: int = 0, sigma: float = 0.02) -> Prices:
-    rng = np.random.default_rng(seed)
-    values = 30 * np.exp(np.cumsum(rng.normal(0, sigma, (800, 3)), axis=0))
     dates = np.arange("2018-09-03", "2022-01-01", dtype="datetime64[D]")
-    return Prices(dates[dates.astype(int) % 7 != 4][:800], ASSETS, values)
+    dates = dates[dates.astype(int) % 7 != 4][:800]
+    return price_table(random_walk(800, seed=seed, volatility=sigma), ASSETS, dates)
 
 
 class Given(Baseline):

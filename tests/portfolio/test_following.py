@@ -11,18 +11,16 @@ from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.mandate.feasible import exactly
 from qfolio.portfolio.policy import Policy
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
+
+from tables import price_table, random_walk
 
 ROWS, LAG = 40, 3
 
 
 @pytest.fixture(scope="module")
 def prices():
-    rng = np.random.default_rng(0)
-    values = 100 * np.exp(np.cumsum(rng.normal(0, 0.02, (ROWS, 3)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(ROWS, dtype="m8[D]")
-    return Prices(dates, ("a", "b", "c"), values)
+    return price_table(random_walk(ROWS, volatility=0.02))
 
 
 @pytest.fixture(scope="module")

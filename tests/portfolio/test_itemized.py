@@ -15,6 +15,8 @@ from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
+from tables import days, price_table, random_walk, weekdays
+
 ROWS, ASSETS = 9, 3
 COLUMNS = ("volume", "spread", "fee", "dividend")
 
@@ -22,8 +24,7 @@ COLUMNS = ("volume", "spread", "fee", "dividend")
 def table(seed: int, rows: int = ROWS, assets: int = ASSETS) -> Prices:
     """Random prices with columns, on days with weekends between them."""
     rng = np.random.default_rng(seed)
-    dates = np.busday_offset("2024-01-01", np.arange(rows), roll="forward")
-    values = 50 * np.exp(np.cumsum(0.03 * rng.normal(size=(rows, assets)), 0))
+    values = random_walk(rows, assets, rng, volatility=0.03)
     features = np.stack(
         [
             1e5 * rng.uniform(0.2, 2, (rows, assets)),
@@ -33,8 +34,8 @@ def table(seed: int, rows: int = ROWS, assets: int = ASSETS) -> Prices:
         ],
         -1,
     )
-    names = tuple("ABCDEFGH"[:assets])
-    return Prices(dates.astype("datetime64[s]"), names, values, features, COLUMNS)
+    dates = weekdays(rows, "2024-01-01")
+    return price_table(values, dates=dates, features=features, feature_names=COLUMNS)
 
 
 def random_model(rng: np.random.Generator) -> Itemized:
@@ -220,10 +221,8 @@ def test_jax_equals_numpy_and_its_derivative_is_exact() -> None:
 def test_the_volatility_of_an_asset_that_joins_late() -> None:
     values = table(3, rows=80).values.copy()
     values[:40, 1] = np.nan
-    prices = Prices(
-        np.datetime64("2024-01-01") + np.arange(80, dtype="m8[D]"), tuple("ABC"), values
-    )
-    found = Conditions.of(prices, Itemized(impact=1, volume="1000")).values["volatility"]
+    model = Itemized(impact=1, volume="1000")
+    found = Conditions.of(price_table(values), model).values["volatility"]
     for row in (0, 3, 30, 45, 60, 79):
         assert found[row, 0] == pytest.approx(volatility(values, row, 0), abs=1e-12)
     for row in range(40, 45):  # it has no five returns yet
@@ -239,8 +238,7 @@ def test_delisted_assets_say_nothing_about_the_volatility_of_a_new_one() -> None
     values[:60, 1], values[20:, 2] = np.nan, values[20, 2]  # B joins, C has paid out
     listed = np.ones(values.shape, bool)
     listed[21:, 2] = False
-    days = np.datetime64("2024-01-01") + np.arange(80, dtype="m8[D]")
-    prices = Prices(days, tuple("ABC"), values, listed=listed)
+    prices = price_table(values, listed=listed)
     found = Conditions.of(prices, Itemized(impact=1, volume="1000")).values["volatility"]
     for row in (45, 62):
         alone = volatility(values, row, 0)
@@ -346,15 +344,15 @@ def test_settings_that_do_not_fit(text: str, said: str) -> None:
 )
 def test_columns_have_the_limits_of_numbers(text: str, wrong: float, said: str) -> None:
     """An interest rate in percent would earn more than all else."""
-    values, rows = table(1, rows=30).values.copy(), np.arange(30)
+    values = table(1, rows=30).values.copy()
     values[:10, 1] = np.nan
     features, bills = np.full((30, 3, 4), 0.01), np.full((30, 1), 0.03)
     features[:10, 1] = np.nan
 
     def trade() -> None:
-        prices = Prices(
-            np.datetime64("2024-01-01") + rows.astype("m8[D]"), tuple("ABC"), values, features,
-            COLUMNS, market=bills, market_names=("bills",),
+        prices = price_table(
+            values, dates=days(30, "2024-01-01"), features=features, feature_names=COLUMNS,
+            market=bills, market_names=("bills",),
         )  # fmt: skip
         Portfolio.of(prices, window=5, horizon=5, cost_model=text)
 

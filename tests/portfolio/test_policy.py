@@ -19,6 +19,7 @@ from qfolio.portfolio.policy import Policy, train
 from qfolio.portfolio.prices.table import Prices
 
 from listeners import Tell
+from tables import featured_table
 
 ROWS, WINDOW = 80, 5
 AGENTS: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -35,13 +36,8 @@ AGENTS: dict[str, tuple[Any, dict[str, Any]]] = {
 }  # fmt: skip
 
 
-def table(rows=ROWS, seed=0, features=1):
-    rng = np.random.default_rng(seed)
-    values = 100 * np.exp(np.cumsum(rng.normal(0.003, 0.02, (rows, 3)), axis=0))
-    extra = rng.normal(3, 2, (rows, 3, features))
-    names = tuple(f"f{i}" for i in range(features))
-    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
-    return Prices(dates, ("a", "b", "c"), values, extra, names)
+def table(rows=ROWS, features=1):
+    return featured_table(rows, features, drift=0.003)
 
 
 def learned(name, agent=None, **changes):

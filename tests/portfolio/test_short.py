@@ -3,15 +3,15 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import Preset, preset
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.short import fitted
 from qfolio.portfolio.task import Portfolio
 
+from tables import price_table, random_walk
+
 
 def months(rows):
-    values = 50 * np.exp(np.cumsum(np.random.default_rng(0).normal(0, 0.04, (rows, 3)), axis=0))
     dates = np.arange(rows).astype("datetime64[M]")
-    return Prices(dates, ("A", "B", "C"), values, note="")
+    return price_table(random_walk(rows, volatility=0.04), dates=dates)
 
 
 def changed(given, **task):

@@ -9,15 +9,15 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.registry import SIGNALS
 from qfolio.portfolio import signals
 from qfolio.portfolio.following import on_table
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
+
+from tables import days, price_table, random_walk
 
 EACH = [f"{name}:8-2" for name in SIGNALS]
 
 
 def prices(rows=60, assets=5, seed=0):
-    rng = np.random.default_rng(seed)
-    values = 50 * np.exp(np.cumsum(rng.normal(0, 0.02, (rows, assets)), axis=0))
+    values = random_walk(rows, assets, seed, volatility=0.02)
     values[:25, -1] = np.nan  # it joins later
     return values
 
@@ -265,9 +265,7 @@ def test_signals_that_are_one_on_a_monthly_table_count_once():
 
 def table(rows=60, every=1):
     """every: days from a row to the next."""
-    values = prices()[:rows, :3]
-    days = every * np.arange(rows, dtype="m8[D]")
-    return Prices(np.datetime64("2020-01-01") + days, ("a", "b", "c"), values)
+    return price_table(prices()[:rows, :3], dates=days(rows * every)[::every])
 
 
 def test_a_portfolio_counts_the_rows_of_its_own_table():
@@ -327,5 +325,4 @@ class Framed(Tomorrow):
 
 
 def test_a_signal_may_be_a_data_frame():
-    prices = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (60, 4)).cumsum(0))
-    assert np.isfinite(signals.compute([Framed(rows=5)], prices)).all()
+    assert np.isfinite(signals.compute([Framed(rows=5)], random_walk(60, 4))).all()

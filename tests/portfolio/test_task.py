@@ -20,17 +20,13 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
 from populations import train_to
+from tables import featured_table, price_table, random_walk
 
 ROWS, ASSETS, WINDOW = 60, 3, 5
 
 
-def table(seed=0, rows=ROWS, features=0):
-    rng = np.random.default_rng(seed)
-    values = 100 * np.exp(np.cumsum(rng.normal(0, 0.02, (rows, ASSETS)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
-    names = tuple(f"f{i}" for i in range(features))
-    extra = rng.normal(3, 2, (rows, ASSETS, features))
-    return Prices(dates, ("a", "b", "c"), values, extra, names)
+def table(features=0):
+    return featured_table(ROWS, features)
 
 
 def portfolio(prices=None, **settings):
@@ -254,12 +250,8 @@ def test_a_menu_of_signals_by_hand():
 
 
 def signalling(**settings):
-    values = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (160, 3)).cumsum(0))
-    prices = Prices(
-        np.datetime64("2020-01-01") + np.arange(160, dtype="m8[D]"), ("a", "b", "c"), values
-    )
     given = {"window": 1, "signals": "momentum:5,volatility:21", "menu": "signals:0.5"}
-    return Portfolio.of(prices, **given, **settings)
+    return Portfolio.of(price_table(random_walk(160)), **given, **settings)
 
 
 def test_a_menu_of_signals_draws_holdings_near_the_anchor():

@@ -33,7 +33,7 @@ from qfolio.portfolio.task import Portfolio
 from qfolio.portfolio.universe import Patterns, spread
 
 from populations import assert_same
-from tables import all_findings
+from tables import all_findings, price_table, random_walk, weekdays
 from tiny import PATHWISE
 
 NAMES = tuple("ABCDEFGH")
@@ -53,8 +53,7 @@ def moving(seed: int, rows: int, assets: int, haircut: float = 0.0) -> tuple[Pri
     Some assets join late, some are delisted, and some are members for a time.
     """
     rng = np.random.default_rng(seed)
-    dates = np.busday_offset("2024-01-01", np.arange(rows), roll="forward")
-    values = 50 * np.exp(np.cumsum(0.03 * rng.normal(size=(rows, assets)), 0))
+    values = random_walk(rows, assets, rng, volatility=0.03)
     late = rng.random(assets) < 0.4
     begin = np.where(late, rng.integers(1, rows // 2, assets), 0)
     ends = rng.random(assets) < 0.5
@@ -67,7 +66,7 @@ def moving(seed: int, rows: int, assets: int, haircut: float = 0.0) -> tuple[Pri
     member = rng.random((rows, assets)) < 0.8
     member[:, 0] = True
     content: dict[str, Any] = {"values": values, **paid, "members": member}
-    return Prices(dates.astype("datetime64[s]"), NAMES[:assets], **content), last
+    return price_table(names=NAMES, dates=weekdays(rows, "2024-01-01"), **content), last
 
 
 def frame_of_weights(prices: Prices) -> pd.DataFrame:
@@ -547,10 +546,8 @@ def test_menus_order_what_is_there(menu: str) -> None:
 
 
 def frame_of(rows: int, assets: int) -> pd.DataFrame:
-    rng = np.random.default_rng(0)
-    values = 100 * np.exp(np.cumsum(0.01 * rng.normal(size=(rows, assets)), 0))
     dates = pd.bdate_range("2024-01-01", periods=rows, name="date")
-    return pd.DataFrame(values, dates, list(NAMES[:assets]))
+    return pd.DataFrame(random_walk(rows, assets), dates, list(NAMES[:assets]))
 
 
 def test_a_table_with_leavers_is_read(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from qfolio.portfolio.backtest.baselines import Baseline, Fitted, History, basel
 from qfolio.portfolio.backtest.orders import Orders, orders
 from qfolio.portfolio.backtest.simulation import simulate
 
+from tables import days
+
 FITTED = [name for name in BASELINES if isinstance(baseline(name), Fitted)]
 
 
@@ -38,10 +40,6 @@ def prices(rows: int = 90, assets: int = 4) -> np.ndarray:
     generator = np.random.default_rng(0)
     scales = 0.01 * np.arange(1, assets + 1)
     return np.exp((generator.normal(size=(rows, assets)) * scales + scales / 5).cumsum(0))
-
-
-def days(rows: int) -> np.ndarray:
-    return np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
 
 
 MONTH = 5

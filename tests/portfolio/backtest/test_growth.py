@@ -12,9 +12,9 @@ from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.prices.growth import require_grown
-from qfolio.portfolio.prices.table import Prices
 
 from populations import assert_same
+from tables import price_table, random_walk
 
 ROWS, FIRST = 160, 130  # folds of 30 rows begin at 60, 90, 120 and 150; the third has 10 at first
 SETTINGS = {"rollout_length": 5, "num_envs": 2, "hidden": (4,)}
@@ -23,10 +23,9 @@ AGENT = Preset("pathwise", SETTINGS, episodes=4, seeds=1, task={"window": 5, "ho
 
 def table(rows=ROWS):
     rng = np.random.default_rng(3)
-    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (ROWS, 3)), axis=0))
+    values = random_walk(ROWS, seed=rng, drift=3e-4)
     volumes = rng.uniform(1, 2, (ROWS, 3, 1))
-    dates = np.datetime64("2020-01-01") + np.arange(ROWS, dtype="m8[D]")
-    prices = Prices(dates, ("A", "B", "C"), values, volumes, ("volume",), "made up")
+    prices = price_table(values, features=volumes, feature_names=("volume",), source="made up")
     return prices.between(0, rows)
 
 

@@ -10,6 +10,8 @@ from qfolio.portfolio.backtest import hindsight
 from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.simulation import simulate
 
+from tables import random_walk
+
 
 def growth(prices: np.ndarray) -> np.ndarray:
     """Growth factors of cash and each asset; an asset without a price is worth as much as cash."""
@@ -25,7 +27,7 @@ def test_the_bound_of_covers_example() -> None:
 
 def test_no_constant_weights_grow_more() -> None:
     rng = np.random.default_rng(0)
-    prices = np.exp(rng.normal(5e-4, 0.02, (301, 4)).cumsum(0))
+    prices = random_walk(301, 4, rng, 5e-4, 0.02)
     prices[:100, 2] = np.nan
     bound = constant_bound(growth(prices), 252)
     assert bound is not None

@@ -18,10 +18,10 @@ from qfolio.experiments.machines.processes import Processes
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.kept import LATEST
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.study.run import Study
 
 from listeners import Interrupt
+from tables import price_table, random_walk
 from tiny import PATHWISE
 
 AGENTS = {"pathwise": PATHWISE}
@@ -35,11 +35,9 @@ DQN = {
 }  # fmt: skip
 
 
-def table(seed=0, rows=200):
-    rng = np.random.default_rng(seed)
-    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 30)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
-    return Prices(dates, tuple(f"A{i}" for i in range(30)), values, source=f"made up {seed}")
+def table(seed=0):
+    values = random_walk(200, 30, seed, drift=3e-4)
+    return price_table(values, [f"A{i}" for i in range(30)], source=f"made up {seed}")
 
 
 def create(folder, agents=AGENTS):

@@ -20,6 +20,8 @@ from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.limits import buyable, feasible
 from qfolio.portfolio.prices.table import Prices
 
+from tables import price_table, random_walk
+
 ASSETS = ("A", "B", "C", "D", "E")
 
 MANDATE = {
@@ -44,11 +46,9 @@ AGENTS = {
 
 
 def table(late: int = 0) -> Prices:
-    rng = np.random.default_rng(0)
-    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.02, (200, 5)), axis=0))
+    values = random_walk(200, 5, drift=3e-4, volatility=0.02)
     values[:late, 3] = np.nan
-    dates = np.datetime64("2020-01-01") + np.arange(200, dtype="m8[D]")
-    return Prices(dates, ASSETS, values, note="made up")
+    return price_table(values, ASSETS, note="made up")
 
 
 def create(mandate, folder=None, prices=None, agents=AGENTS, **more) -> Backtest:

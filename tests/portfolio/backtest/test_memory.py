@@ -1,6 +1,5 @@
 """What a backtest needs is said before anything is made."""
 
-import numpy as np
 import pytest
 
 from qfolio.core import devices
@@ -10,13 +9,13 @@ from qfolio.portfolio.backtest.memory import needed, total
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.prices.table import Prices
 
+from tables import price_table, random_walk
+
 GIB = 2**30
 
 
-def table(assets: int = 40, rows: int = 600) -> Prices:
-    dates = np.datetime64("2020-01-01", "D") + np.arange(rows, dtype="m8[D]")
-    moves = np.random.default_rng(0).normal(0, 0.01, (rows, assets))
-    return Prices(dates, tuple(f"A{j}" for j in range(assets)), np.exp(moves.cumsum(0)))
+def table() -> Prices:
+    return price_table(random_walk(600, 40), [f"A{j}" for j in range(40)])
 
 
 def create(prices: Prices, **options) -> Backtest:

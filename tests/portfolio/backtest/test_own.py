@@ -12,18 +12,19 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
+from tables import days, price_table, random_walk
 from tiny import PATHWISE
 
 AGENTS = {"pathwise": PATHWISE}
 ROWS, FIRST, LAST = 160, 98, 157  # rows of the table, and of the first and the last decision
+DAYS = days(ROWS).astype(str)
 
 
-def table(rows=ROWS, step="D", late=0):
-    rng = np.random.default_rng(0)
-    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0))
+def table(rows=ROWS, every=1, late=0):
+    """every: days from a row to the next."""
+    values = random_walk(rows, drift=3e-4)
     values[:late, 2] = np.nan
-    dates = np.datetime64("2020-01-01", "s") + np.arange(rows) * np.timedelta64(1, step)
-    return Prices(dates, ("A", "B", "C"), values)
+    return price_table(values, dates=days(rows * every)[::every])
 
 
 def create(prices=None, out=None, **options):
@@ -32,12 +33,8 @@ def create(prices=None, out=None, **options):
     return Backtest.create(prices, AGENTS, out=out, **{**rest, **options})
 
 
-def days(prices=None):
-    return (table() if prices is None else prices).dates.astype("datetime64[D]").astype(str)
-
-
 def weights(rows, **columns):
-    return pd.DataFrame({"date": days()[rows], **columns})
+    return pd.DataFrame({"date": DAYS[rows], **columns})
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +45,9 @@ def finished(tmp_path_factory):
     weights([0, 100, 120], A=[0.5, 0.2, 0.0], cash=[0.5, 0.8, 1.0]).to_csv(
         place / "mine.csv", index=False
     )
-    returns = pd.DataFrame({"date": days(), "return": rng.normal(0, 0.01, ROWS)})
+    returns = pd.DataFrame({"date": DAYS, "return": rng.normal(0, 0.01, ROWS)})
     returns.to_csv(place / "fund.csv", index=False)
-    level = pd.DataFrame({"date": days(), "level": table().values.mean(1)}).drop(index=[120, 121])
+    level = pd.DataFrame({"date": DAYS, "level": table().values.mean(1)}).drop(index=[120, 121])
     level.to_csv(place / "index.csv", index=False)
     backtest = create(
         out=place / "run",
@@ -85,7 +82,7 @@ def test_returns_pass_through_exactly(finished):
 def test_an_index_earns_what_its_levels_say(finished):
     backtest, _, level = finished
     earned = backtest.entries()[0]["index"].simulation.returns[0]
-    known = pd.Series(level["level"].to_numpy(), level["date"]).reindex(days()).ffill()
+    known = pd.Series(level["level"].to_numpy(), level["date"]).reindex(DAYS).ffill()
     expected = known.pct_change().to_numpy()[FIRST + 2 : LAST + 3]
     np.testing.assert_allclose(earned, expected, atol=1e-15)
     assert earned[120 - FIRST - 2] == 0  # a holiday: the last level stands
@@ -163,7 +160,7 @@ def test_later_rows_change_nothing_earlier():
 @pytest.mark.parametrize("quantity", ["weight", "shares"])
 def test_orders_after_the_last_price_wait_for_it(quantity):
     """A month's order may be dated on the Sunday after the table's last Friday."""
-    dates, asset = [days()[100], "2020-06-09", "2020-06-14"], ["A", "A", "B"]
+    dates, asset = [DAYS[100], "2020-06-09", "2020-06-14"], ["A", "A", "B"]
     source = pd.DataFrame({"date": dates, "asset": asset, quantity: [0.5, 0.5, 0.5]})
     if quantity == "shares":
         cash = pd.DataFrame({"date": dates[:1], "asset": ["cash"], "shares": [100.0]})
@@ -184,7 +181,7 @@ def test_a_holding_from_before_the_test_has_earned_interest():
 
 
 def test_cash_until_the_first_order_and_dates_between_rows():
-    prices = table(step="W")  # Wednesdays
+    prices = table(every=7)  # Wednesdays
     source = pd.DataFrame({"date": ["2021-12-31", "2022-03-31"], "A": [1.0, 0.5], "B": [0, 0.5]})
     decisions, notes = placed(source, prices)
     given = np.flatnonzero(~np.isnan(decisions[:, 0]))
@@ -203,23 +200,23 @@ def test_cash_until_the_first_order_and_dates_between_rows():
 @pytest.mark.parametrize(
     "source",
     [
-        pd.DataFrame({"date": days()[[110] * 2], "asset": ["A", "B"], "weight": [0.25, 0.75]}),
-        pd.DataFrame({"Date": days()[[110]], "B": ["0.75"], "A": [0.25], "CASH": [0.0]}),
-        pd.DataFrame({"A": [0.25], "B": [0.75]}, index=pd.DatetimeIndex(days()[[110]])),
-        pd.DataFrame({"date": days()[[110, 111]], "A": [0.25, None], "B": [0.75, None]}),
-        pd.DataFrame({"date": days()[[110]], "A": [0.2502], "B": [0.7506]}),  # rounded
+        pd.DataFrame({"date": DAYS[[110] * 2], "asset": ["A", "B"], "weight": [0.25, 0.75]}),
+        pd.DataFrame({"Date": DAYS[[110]], "B": ["0.75"], "A": [0.25], "CASH": [0.0]}),
+        pd.DataFrame({"A": [0.25], "B": [0.75]}, index=pd.DatetimeIndex(DAYS[[110]])),
+        pd.DataFrame({"date": DAYS[[110, 111]], "A": [0.25, None], "B": [0.75, None]}),
+        pd.DataFrame({"date": DAYS[[110]], "A": [0.2502], "B": [0.7506]}),  # rounded
         np.where(np.arange(ROWS)[:, None] == 110, [0.0, 0.25, 0.75, 0.0], np.nan).tolist(),
     ],
 )
 def test_forms_of_weights(source):
     own = read_own("mine", source, table())
     assert own.kind == "weights"
-    np.testing.assert_array_equal(own.dates.astype("datetime64[D]").astype(str), [days()[110]])
+    np.testing.assert_array_equal(own.dates.astype("datetime64[D]").astype(str), [DAYS[110]])
     np.testing.assert_allclose(own.values, [[0, 0.25, 0.75, 0]], atol=1e-12)
 
 
 def test_forms_of_returns():
-    series = pd.Series(np.arange(ROWS) / 1e4, pd.DatetimeIndex(days()), name="return")
+    series = pd.Series(np.arange(ROWS) / 1e4, pd.DatetimeIndex(DAYS), name="return")
     for source in (series, series.to_numpy()):
         own = read_own("mine", source, table())
         assert own.kind == "returns"
@@ -279,8 +276,8 @@ def test_an_order_of_a_delisted_asset_is_refused():
 
 
 def test_a_return_on_a_day_between_rows_is_refused():
-    prices = table(step="W")
-    dates = [*days(prices), "2022-03-31"]
+    prices = table(every=7)
+    dates = [*prices.dates.astype("datetime64[D]").astype(str), "2022-03-31"]
     with pytest.raises(QfolioError, match="return on 2022-03-31, which is not a row"):
         placed(pd.DataFrame({"date": dates, "return": 0.001}), prices)
 

@@ -28,7 +28,7 @@ from qfolio.portfolio.following import begin, follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices, load
 
 from listeners import Interrupt, Tell
-from tables import write_table
+from tables import price_table, random_walk, write_table
 
 AGENTS = {
     "dqn": Preset(
@@ -45,10 +45,8 @@ AGENTS = {
 
 
 def table(rows=260, seed=0):
-    rng = np.random.default_rng(seed)
-    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
-    return Prices(dates, ("A", "B", "=<b>C"), values, note="made up")
+    values = random_walk(rows, seed=seed, drift=3e-4)
+    return price_table(values, ("A", "B", "=<b>C"), note="made up")
 
 
 def create(folder=None, prices=None, agents=AGENTS, **settings):

@@ -13,15 +13,15 @@ from qfolio.portfolio.desk.follow import Following
 from qfolio.portfolio.desk.ledger import Record
 from qfolio.portfolio.desk.live import mark
 from qfolio.portfolio.itemized import Itemized
-from qfolio.portfolio.prices.table import Prices
+
+from tables import days, price_table, random_walk
 
 NAMES = ("A", "B", "C")
 
 
 def table(rows=60, seed=0):
-    rng = np.random.default_rng(seed)
-    values = 50 * np.exp(rng.normal(0, 0.02, (rows, 3)).cumsum(0))
-    return Prices(np.datetime64("2024-01-01") + np.arange(rows, dtype="m8[D]"), NAMES, values)
+    values = random_walk(rows, seed=seed, volatility=0.02)
+    return price_table(values, dates=days(rows, "2024-01-01"))
 
 
 class Fixed:
@@ -138,11 +138,7 @@ def test_carry_is_paid_in_cash_where_the_replay_reinvests_it(rate):
 
 
 def by_hand(values, shares, cash, trades):
-    prices = Prices(
-        np.datetime64("2024-01-01") + np.arange(len(values), dtype="m8[D]"),
-        ("A",),
-        np.array(values),
-    )
+    prices = price_table(np.array(values), dates=days(len(values), "2024-01-01"))
     plan = Allocation(
         "2024-01-01", ("A",), prices.values[0], np.array([shares]), cash,
         np.array([0.5, 0.5]), np.array([trades]), {}, 0.0,

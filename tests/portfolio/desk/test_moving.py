@@ -16,6 +16,8 @@ from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.live import mark
 from qfolio.portfolio.prices.table import Prices
 
+from tables import days, price_table, random_walk
+
 ASSETS = ("A", "B", "C", "D", "E")
 ROWS, FIRST, NOW, LEAVES = 170, 140, 150, 156
 AGENT = Preset(
@@ -31,16 +33,15 @@ MANDATE = {
 
 def table(rows: int) -> Prices:
     """E joins, C is no member around row NOW, D is delisted before it, and B at LEAVES."""
-    rng = np.random.default_rng(1)
-    values = 50 * np.exp(np.cumsum(0.02 * rng.normal(size=(ROWS, 5)), 0))
+    values = random_walk(ROWS, 5, seed=1, volatility=0.02)
     listed, members = np.ones((ROWS, 5), bool), np.ones((ROWS, 5), bool)
     values[:60, 4], listed[:60, 4] = np.nan, False
     for asset, row, paid in ((3, NOW - 5, 0.5), (1, LEAVES, 0.8)):
         values[row:, asset] = values[row - 1, asset] * paid
         listed[row:, asset] = False
     members[NOW - 3 : NOW + 3, 2] = False
-    dates = np.datetime64("2024-01-01", "s") + np.arange(ROWS) * np.timedelta64(1, "D")
-    return Prices(dates, ASSETS, values, listed=listed, members=members).between(0, rows)
+    dates = days(ROWS, "2024-01-01")
+    return price_table(values, ASSETS, dates, listed=listed, members=members).between(0, rows)
 
 
 @pytest.fixture(scope="module")

@@ -8,22 +8,16 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.reference import reference
-from qfolio.portfolio.prices.table import Prices
 
+from tables import days, price_table, random_walk
 from tiny import PATHWISE
 
 AGENTS = {"pathwise": PATHWISE}
+DAYS = days(190).astype(str)
 
 
 def table(rows=160):
-    rng = np.random.default_rng(0)
-    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (200, 3)), axis=0))
-    dates = np.datetime64("2020-01-01", "s") + np.arange(200) * np.timedelta64(1, "D")
-    return Prices(dates, ("A", "B", "C"), values).between(None, rows)
-
-
-def days(rows):
-    return table(200).dates[rows].astype("datetime64[D]").astype(str)
+    return price_table(random_walk(rows, drift=3e-4))
 
 
 def desk(out, benchmark, **options):
@@ -33,8 +27,8 @@ def desk(out, benchmark, **options):
     return Desk.open(out)
 
 
-ORDERS = pd.DataFrame({"date": days([40, 110, 130]), "A": [0.6, 0.2, 0.5], "B": [0.4, 0.8, 0.1]})
-INDEX = pd.DataFrame({"date": days(slice(160)), "level": np.exp(np.arange(160) * 1e-3)})
+ORDERS = pd.DataFrame({"date": DAYS[[40, 110, 130]], "A": [0.6, 0.2, 0.5], "B": [0.4, 0.8, 0.1]})
+INDEX = pd.DataFrame({"date": DAYS[:160], "level": np.exp(np.arange(160) * 1e-3)})
 
 
 @pytest.mark.parametrize(
@@ -64,7 +58,7 @@ def test_a_table_of_ones_own_goes_on_with_its_latest_rows(tmp_path):
     made, later = desk(tmp_path / "index", INDEX), table(190)
     with pytest.raises(QfolioError, match=r"no level on 2020-06-.* latest table with --benchmark"):
         reference(made, later, 159, 28, None)
-    longer = pd.DataFrame({"date": days(slice(190)), "level": np.exp(np.arange(190) * 1e-3)})
+    longer = pd.DataFrame({"date": DAYS, "level": np.exp(np.arange(190) * 1e-3)})
     longer.to_csv(tmp_path / "index.csv", index=False)
     found, _ = reference(made, later, 159, 28, tmp_path / "index.csv")
     np.testing.assert_allclose(found, np.expm1(1e-3))

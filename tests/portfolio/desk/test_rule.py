@@ -14,30 +14,25 @@ from qfolio.portfolio.desk.follow import follow
 from qfolio.portfolio.desk.standing import Standing
 from qfolio.portfolio.prices.table import Prices
 
+from tables import days, price_table, random_walk
 from tiny import PATHWISE
 
 ACTIVE = {**PATHWISE.task, "anchor": "equal-weight", "active": True}  # as in PPO's preset
 AGENTS = {"pathwise": PATHWISE._replace(task=ACTIVE)}
 NAMES = ("cash", "A", "B", "C")
+DAYS = days(160).astype(str)
 
 
 def table():
-    rng = np.random.default_rng(0)
-    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (160, 3)), axis=0))
-    dates = np.datetime64("2020-01-01", "s") + np.arange(160) * np.timedelta64(1, "D")
-    return Prices(dates, NAMES[1:], values)
+    return price_table(random_walk(160, drift=3e-4))
 
 
-def days(rows):
-    return table().dates[rows].astype("datetime64[D]").astype(str)
-
-
-WEIGHTS = pd.DataFrame({"date": days([40, 110, 130]), "A": [0.6, 0.2, 0.5], "B": [0.4, 0.7, 0.1]})
+WEIGHTS = pd.DataFrame({"date": DAYS[[40, 110, 130]], "A": [0.6, 0.2, 0.5], "B": [0.4, 0.7, 0.1]})
 SHARES = pd.DataFrame(
-    {"date": days([40, 40, 120]), "asset": ["cash", "A", "B"], "shares": [1000.0, 5.0, 3.0]}
+    {"date": DAYS[[40, 40, 120]], "asset": ["cash", "A", "B"], "shares": [1000.0, 5.0, 3.0]}
 )
-RETURNS = pd.DataFrame({"date": days(slice(160)), "return": np.full(160, 1e-3)})
-INDEX = pd.DataFrame({"date": days(slice(160)), "level": np.exp(np.arange(160) * 1e-3)})
+RETURNS = pd.DataFrame({"date": DAYS, "return": np.full(160, 1e-3)})
+INDEX = pd.DataFrame({"date": DAYS, "level": np.exp(np.arange(160) * 1e-3)})
 
 
 @pytest.fixture(scope="module")

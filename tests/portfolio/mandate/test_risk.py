@@ -19,6 +19,8 @@ from qfolio.portfolio.mandate.risk import Risk
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
+from tables import price_table
+
 ASSETS = ("A", "B", "C", "D", "E")
 
 ROWS = 400
@@ -28,7 +30,7 @@ def table(seed: int = 0, rows: int = ROWS) -> Prices:
     rng = np.random.default_rng(seed)
     scale = rng.uniform(0.005, 0.03, 5) * np.exp(rng.normal(0, 0.3, (rows, 1)))
     values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 1, (rows, 5)) * scale, axis=0))
-    return Prices(np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]"), ASSETS, values)
+    return price_table(values, ASSETS)
 
 
 def portfolio(prices: Prices, risk: dict, **limits) -> Portfolio:

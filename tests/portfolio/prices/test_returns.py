@@ -10,7 +10,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.prices.findings import Finding
 from qfolio.portfolio.prices.table import Prices, describe, load
 
-from tables import all_findings
+from tables import all_findings, random_walk
 
 ROWS = 80
 DAYS = pd.bdate_range("2020-01-01", periods=ROWS)
@@ -18,8 +18,7 @@ NAN = np.nan
 
 
 def prices(seed: int = 0) -> pd.DataFrame:
-    moves = np.random.default_rng(seed).normal(0, 0.01, (ROWS, 3))
-    return pd.DataFrame(50 * np.exp(moves.cumsum(0)), index=DAYS, columns=list("ABC"))
+    return pd.DataFrame(random_walk(ROWS, seed=seed), index=DAYS, columns=list("ABC"))
 
 
 def found(source: Any, severity: str, **options: Any) -> list[Finding]:

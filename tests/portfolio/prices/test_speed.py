@@ -4,7 +4,6 @@ import time
 from pathlib import Path
 from unittest.mock import Mock
 
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -12,11 +11,12 @@ from qfolio import cli
 from qfolio.portfolio.prices import delimited
 from qfolio.portfolio.prices.table import load
 
+from tables import random_walk
+
 
 def table(path: Path, rows: int, assets: int) -> Path:
-    moves = np.random.default_rng(0).normal(0, 0.01, (rows, assets))
     dates = pd.date_range("2000-01-03", periods=rows, freq="h")
-    frame = pd.DataFrame(100 * np.exp(moves.cumsum(0)), dates)
+    frame = pd.DataFrame(random_walk(rows, assets), dates)
     frame.columns = [f"A{j}" for j in range(assets)]
     frame.rename_axis("date").to_csv(path, float_format="%.4f")
     return path

@@ -7,15 +7,14 @@ import pandas as pd
 
 from qfolio.portfolio.prices.findings import Finding
 
-from tables import all_findings
+from tables import all_findings, random_walk
 
 ROWS, ASSETS = 500, 6
 DAYS = pd.bdate_range("2020-01-01", periods=ROWS)
 
 
 def market(days: pd.DatetimeIndex = DAYS, seed: int = 0) -> pd.DataFrame:
-    moves = np.random.default_rng(seed).normal(0, 0.01, (len(days), ASSETS))
-    return pd.DataFrame(50 * np.exp(moves.cumsum(0)), days, list("ABCDEF"))
+    return pd.DataFrame(random_walk(len(days), ASSETS, seed), days, list("ABCDEF"))
 
 
 def found(table: pd.DataFrame, severity: str | None = None, **options: Any) -> list[Finding]:

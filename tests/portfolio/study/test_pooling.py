@@ -15,8 +15,8 @@ from qfolio.portfolio.study.pooling import (
     z_of,
 )
 
-from backtests import weekdays
 from studies import made_up
+from tables import weekdays
 
 
 def days(first, count):
@@ -152,7 +152,7 @@ def text(dates):
 
 def test_rows_of_any_length_share_shocks():
     x = np.random.default_rng(5).standard_normal(1200)
-    dates = weekdays("2001-01-01", 1200).astype("M8[D]")
+    dates = weekdays(1200, "2001-01-01").astype("M8[D]")
     weeks, weekly = by_period(dates, x, "W")
     months, monthly = by_period(dates, x, "M")
     day, first = np.timedelta64(1, "D"), months.astype("M8[M]")
@@ -179,7 +179,7 @@ def test_rows_of_any_length_share_shocks():
 def test_shocks_that_arrive_a_day_later_are_shared():
     """As in Asia those of America; from two years on, months show it."""
     x = np.random.default_rng(5).standard_normal(1201)
-    days = text(weekdays("2001-01-01", 1200).astype("M8[D]"))
+    days = text(weekdays(1200, "2001-01-01").astype("M8[D]"))
     assert correlations([days, days], [x[1:], x[:-1]])[0, 1] > 0.85
     assert correlations([days[:200]] * 2, [x[1:201], x[:200]])[0, 1] < 0.3
     rng = np.random.default_rng(6)
@@ -190,7 +190,7 @@ def test_shocks_that_arrive_a_day_later_are_shared():
 def test_one_market_with_two_frequencies_counts_once():
     """Were its rows independent, its z would be √2 times as large."""
     rng = np.random.default_rng(7)
-    dates = weekdays("2001-01-01", 1500).astype("M8[D]")
+    dates = weekdays(1500, "2001-01-01").astype("M8[D]")
 
     def table(days, active, year):
         flat = np.zeros(len(days))

@@ -14,16 +14,14 @@ from qfolio.portfolio.study.run import Study, corrected, summarize
 
 from listeners import Interrupt
 from studies import made_up, study
+from tables import price_table, random_walk
 from tiny import PATHWISE
 
 AGENTS = {"pathwise": PATHWISE}
 
 
 def table(seed, rows=160):
-    rng = np.random.default_rng(seed)
-    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
-    return Prices(dates, ("A", "B", "C"), values, source=f"made up {seed}")
+    return price_table(random_walk(rows, seed=seed, drift=3e-4), source=f"made up {seed}")
 
 
 TABLES = {"one": table(0), "two": table(1)}

@@ -11,7 +11,8 @@ from qfolio.report.backtest.data import BacktestData, shown_order
 from qfolio.report.backtest.holdings import BLOCKS, NAMED
 from qfolio.report.backtest.page import render_backtest, write_backtest_report
 
-from backtests import Page, make_data, make_series, usual, weekdays
+from backtests import Page, make_data, make_series, usual
+from tables import weekdays
 
 
 def test_numbers_of_the_charts(data: BacktestData, page: Page) -> None:
@@ -48,7 +49,7 @@ def test_weights_are_grouped_and_add_up() -> None:
     weights[:, 7] = 0.75
     series["agent"] = replace(series["agent"], weights=weights)
     assets = tuple(f"asset {i}" for i in range(1, 31))
-    shown = Page(render_backtest(make_data(series, weekdays("2020-01-01", 40), assets))).data
+    shown = Page(render_backtest(make_data(series, weekdays(40), assets))).data
     for entry in shown["weights"]["series"]:
         assert len(entry["names"]) == NAMED + 2 == len(entry["values"])
         assert entry["names"][-1] == f"{30 - NAMED} others"
@@ -81,7 +82,7 @@ def test_page_of_a_long_backtest_stays_small(tmp_path: Path) -> None:
         for i, kind in enumerate(kinds)
     }
     assets = tuple(f"asset {i}" for i in range(20))
-    write_backtest_report(tmp_path, make_data(series, weekdays("1995-01-02", 7000), assets))
+    write_backtest_report(tmp_path, make_data(series, weekdays(7000, "1995-01-02"), assets))
     size = (tmp_path / "report.html").stat().st_size
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert size < 8e6
@@ -97,7 +98,7 @@ def test_only_what_matters_is_bright_at_first() -> None:
         name: make_series(rng, kind, 1, 40, 2, 0.01 if name == "other 0" else 0.0)
         for name, kind in kinds.items()
     }
-    data = make_data(series, weekdays("2020-01-01", 40), ("A", "B"))
+    data = make_data(series, weekdays(40), ("A", "B"))
     page = Page(render_backtest(data))
     names = shown_order(data)
     assert data.assessment.best_baseline == "other 0"
@@ -125,7 +126,7 @@ def test_holdings_are_weights_against_the_reference() -> None:
     series = {
         name: replace(each, weights=np.tile(held[name], (40, 1))) for name, each in series.items()
     }
-    data = make_data(series, weekdays("2020-01-01", 40), ("A", "B", "C"))
+    data = make_data(series, weekdays(40), ("A", "B", "C"))
     shown = Page(render_backtest(data)).data["weights"]
     agent, reference = shown["series"]
     assert agent["names"] == ["Cash", "A", "B", "C"]

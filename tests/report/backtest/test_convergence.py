@@ -4,7 +4,8 @@ import pytest
 from qfolio.report.backtest.convergence import POINTS, FoldTraining, convergence_sentences
 from qfolio.report.backtest.page import render_backtest
 
-from backtests import make_data, make_series, weekdays
+from backtests import make_data, make_series
+from tables import weekdays
 
 
 def training(slope_at_end, seed=0):
@@ -61,13 +62,13 @@ def test_the_page_says_whether_training_converged():
     series = {"dqn": make_series(rng, "agent", 2, 300, 3, 0.0),
               "equal weight": make_series(rng, "baseline", 1, 300, 3, 0.0)}  # fmt: skip
     folds = [fold_of(training(slope, i)) for i, slope in enumerate((2.0, 0.0))]
-    data = make_data(series, weekdays("2020-01-01", 300), ("A", "B", "C"), training={"dqn": folds})
+    data = make_data(series, weekdays(300), ("A", "B", "C"), training={"dqn": folds})
     page = render_backtest(data)
     assert (
         "dqn: in 1 of 2 folds the returns were still rising; training for longer may help." in page
     )
     assert page.count("Returns of training episodes, fold by fold") == 1
-    without = render_backtest(make_data(series, weekdays("2020-01-01", 300), ("A", "B", "C")))
+    without = render_backtest(make_data(series, weekdays(300), ("A", "B", "C")))
     assert "Did training converge?" not in without
     assert convergence_sentences({"a": [folds[1]]}) == [
         "a: in none of 1 folds were the returns still rising."

@@ -11,7 +11,8 @@ from qfolio.report.backtest.page import render_backtest
 from qfolio.report.backtest.tearsheet import BINS, LISTED, tear_sheet
 from qfolio.report.rendering import number, percent
 
-from backtests import Page, make_data, make_series, usual, weekdays
+from backtests import Page, make_data, make_series, usual
+from tables import weekdays
 
 
 def test_figures_are_means_over_seeds() -> None:
@@ -121,7 +122,7 @@ def test_contributions_add_up_on_the_page() -> None:
     names = tuple(f"asset {i}" for i in range(40))
     series = make_series(rng, "baseline", 1, 100, 40, 0.001)
     moves = 0.01 * rng.normal(size=(100, 40))
-    data = make_data({"equal weight": series}, weekdays("2020-01-01", 100), names, moves=moves)
+    data = make_data({"equal weight": series}, weekdays(100), names, moves=moves)
     rows = tear_sheet(["equal weight"], data)["each"][0]["assets"]
     assert len(rows) == LISTED + 3
     assert [row["name"] for row in rows[-3:]] == [
@@ -146,6 +147,6 @@ def test_a_thousand_assets_keep_the_page_small() -> None:
         }.items()
     }  # fmt: skip
     moves = 0.01 * rng.normal(size=(600, 1000))
-    page = render_backtest(make_data(series, weekdays("2020-01-01", 600), names, moves=moves))
+    page = render_backtest(make_data(series, weekdays(600), names, moves=moves))
     assert len(page.encode()) < 7e6
     assert "988 others" in Page(page).text

@@ -11,6 +11,8 @@ from qfolio.portfolio.backtest.attribution.decomposition import decompose
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.synthetic.ar1 import Ar1
 
+from tables import random_walk
+
 
 def decomposed(prices, decisions, cost=0.002, folds=None):
     """A replay from row 0 on with a lag of 1, and its parts at 252 days a year."""
@@ -24,9 +26,8 @@ def decomposed(prices, decisions, cost=0.002, folds=None):
     return found, parts
 
 
-def random_prices(rows=402, assets=4, seed=0):
-    rng = np.random.default_rng(seed)
-    return 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.02, (rows, assets)), 0))
+def random_prices():
+    return random_walk(402, 4, drift=3e-4, volatility=0.02)
 
 
 def test_the_parts_add_up_exactly():

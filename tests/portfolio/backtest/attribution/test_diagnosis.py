@@ -7,13 +7,14 @@ from qfolio.portfolio.backtest.attribution.diagnosis import diagnose, idle
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.simulation import simulate
 
+from tables import random_walk
+
 DAYS = 200
 FOLDS = [slice(0, 100), slice(100, DAYS)]
 
 
 def entry(*seeds):
-    prices = 50 * np.exp(np.cumsum(np.random.default_rng(0).normal(0, 0.01, (DAYS + 2, 3)), 0))
-    decisions = np.array(seeds, float)
+    prices, decisions = random_walk(DAYS + 2), np.array(seeds, float)
     return Entry("agent", decisions, simulate(prices, decisions, first=0, cost=0.001))
 
 

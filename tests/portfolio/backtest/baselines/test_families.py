@@ -9,11 +9,12 @@ from qfolio.portfolio.backtest.baselines.base import nearest
 from qfolio.portfolio.backtest.baselines.online import Olmar, Pamr
 from qfolio.portfolio.backtest.baselines.optimizers import HierarchicalRiskParity
 
+from tables import days
+
 
 def history(prices: np.ndarray, month: int = 21, cap: float = 1.0) -> History:
     rows, assets = prices.shape
-    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
-    return History(dates, prices, slice(0, rows), np.ones(assets, bool), cap, month)
+    return History(days(rows), prices, slice(0, rows), np.ones(assets, bool), cap, month)
 
 
 def decide(name: str | Baseline, prices: np.ndarray, held: np.ndarray, **more: float) -> np.ndarray:
