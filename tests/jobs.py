@@ -133,6 +133,20 @@ class Pretended:
         return self.left == 0
 
 
+def silent(job):
+    """No listeners."""
+    return ()
+
+
+def wait_until(condition, seconds=240):
+    """Waits for a condition, long enough for a busy machine; returns True."""
+    end = time.perf_counter() + seconds
+    while not condition():
+        assert time.perf_counter() < end
+        time.sleep(0.02)
+    return True
+
+
 def alive(process: int) -> bool:
     """Whether a process runs; a dead one that nobody has waited for does not."""
     try:

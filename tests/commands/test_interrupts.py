@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from jobs import alive
+from jobs import alive, wait_until
 from shell import qfolio
 from tables import write_table
 
@@ -150,10 +150,7 @@ def test_ctrl_c_with_workers(tmp_path, count):
     assert err in ("", f"qfolio: interrupted. Resume with: {resume}\n")
     if count == 1:
         assert out.splitlines()[-1] == f"Stopped. Resume with: {resume}"
-    end = time.perf_counter() + 10
-    while any(map(alive, workers)):
-        assert time.perf_counter() < end
-        time.sleep(0.05)
+    wait_until(lambda: not any(map(alive, workers)), seconds=10)
 
 
 def test_ctrl_c_during_the_report_says_how_to_go_on(folder, monkeypatch, tmp_path):
@@ -167,10 +164,7 @@ def test_ctrl_c_during_the_report_says_how_to_go_on(folder, monkeypatch, tmp_pat
         stderr=subprocess.PIPE,
         text=True,
     )
-    end = time.perf_counter() + 120
-    while not (run / "returns.csv").exists():  # of all results the first
-        assert time.perf_counter() < end
-        time.sleep(0.01)
+    wait_until((run / "returns.csv").exists)  # of all results the first
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err

@@ -20,18 +20,7 @@ from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.processes import Processes
 
 import jobs
-from jobs import Add, Die, Fail, Print, Sleep, Tell, alive
-
-
-def silent(job):
-    return ()
-
-
-def wait_for(*files):
-    end = time.perf_counter() + 60
-    while not all(file.exists() for file in files):
-        assert time.perf_counter() < end, "no worker has begun"
-        time.sleep(0.02)
+from jobs import Add, Die, Fail, Print, Sleep, Tell, alive, silent, wait_until
 
 
 @pytest.mark.parametrize(
@@ -87,7 +76,7 @@ def test_ctrl_c_ends_workers_that_are_kept_between_maps(tmp_path):
     """In a later map as in the first."""
 
     def press():
-        wait_for(tmp_path / "a")
+        wait_until((tmp_path / "a").exists)
         os.kill(os.getpid(), signal.SIGINT)
 
     begun = time.perf_counter()
@@ -173,7 +162,7 @@ def test_ctrl_c_ends_all_workers_and_keeps_what_is_done(tmp_path):
     work: list[Job] = [Add("done", 1.0), *(Sleep(name, tmp_path) for name in names)]
 
     def press():
-        wait_for(*files)
+        wait_until(lambda: all(file.exists() for file in files))
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=press).start()
@@ -186,7 +175,7 @@ def test_ctrl_c_ends_all_workers_and_keeps_what_is_done(tmp_path):
 def test_a_reader_that_leaves_ends_all_workers(tmp_path):
     run = Processes(2).map([Add("done", 1.0), Sleep("a", tmp_path)], silent)
     next(run)
-    wait_for(tmp_path / "a")
+    wait_until((tmp_path / "a").exists)
     run.close()
     assert not alive(int((tmp_path / "a").read_text()))
 
@@ -235,10 +224,8 @@ def test_workers_end_with_a_driver_that_is_killed(tmp_path):
         "    list(Processes(1).map([Sleep('a', Path(sys.argv[1]))], lambda job: ()))\n"
     )
     driver = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), *sys.path])
-    wait_for(tmp_path / "a")
+    wait_until((tmp_path / "a").exists)
     driver.kill()
     driver.wait()
-    process, end = int((tmp_path / "a").read_text()), time.perf_counter() + 10
-    while alive(process):
-        assert time.perf_counter() < end
-        time.sleep(0.05)
+    process = int((tmp_path / "a").read_text())
+    wait_until(lambda: not alive(process), seconds=10)

@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -27,7 +26,7 @@ from qfolio.experiments.machines.schedule import ATTEMPTS
 from qfolio.experiments.run import Run
 
 import jobs
-from jobs import Add, Die, Fail, Meet, Sleep, alive
+from jobs import Add, Die, Fail, Meet, Sleep, alive, silent, wait_until
 
 pytestmark = [
     pytest.mark.filterwarnings("default"),  # Ray's own
@@ -38,10 +37,6 @@ needs_ray = [
         importlib.util.find_spec("ray") is None, reason='needs pip install "ray[client]"'
     ),
 ]
-
-
-def silent(job):
-    return ()
 
 
 def test_without_ray(monkeypatch):
@@ -129,7 +124,7 @@ class TestRay:
         stored = {(result["place"], result["table"]) for result in results.values()}
         places = {place for place, _ in stored}
         assert len(stored) == len(places) > 1
-        assert wait(lambda: not any(map(alive, places)))
+        assert wait_until(lambda: not any(map(alive, places)))
 
     @pytest.mark.skipif(
         importlib.util.find_spec("grpc") is None, reason='needs pip install "ray[client]"'
@@ -208,7 +203,7 @@ class TestRay:
         environment = os.environ | {"RAY_ADDRESS": nodes.cluster.address}
         driver = subprocess.Popen([sys.executable, "-c", code, str(folder)], env=environment)
         try:
-            wait(lambda: any((folder / "seeds").glob("[0-9]")))
+            wait_until(lambda: any((folder / "seeds").glob("[0-9]")))
         finally:
             driver.kill()
             driver.wait()
@@ -240,14 +235,14 @@ class TestRay:
         names = ("a", "b")
 
         def press():
-            wait(lambda: all((tmp_path / name).exists() for name in names))
+            wait_until(lambda: all((tmp_path / name).exists() for name in names))
             os.kill(os.getpid(), signal.SIGINT)
 
         threading.Thread(target=press).start()
         work: list[Job] = [Add("done", 1.0), *(Sleep(name, tmp_path) for name in names)]
         assert [job.name for job, _ in on("ray").map(work, silent)] == ["done"]
         places = [int((tmp_path / name).read_text()) for name in names]
-        assert wait(lambda: not any(map(alive, places)))
+        assert wait_until(lambda: not any(map(alive, places)))
 
     def test_other_versions_are_refused(self, nodes, monkeypatch):
         monkeypatch.setattr(dispatch, "versions", lambda: {"qfolio": "99"})
@@ -273,18 +268,10 @@ class TestRay:
         names = [str(i) for i in range(3)]
 
         def remove():
-            wait(lambda: all((tmp_path / name).exists() for name in names))
+            wait_until(lambda: all((tmp_path / name).exists() for name in names))
             nodes.cluster.remove_node(nodes.nodes[0], allow_graceful=False)
 
         threading.Thread(target=remove).start()
         work = [Sleep(name, tmp_path, seconds=10.0) for name in names]
         results = {job.name: result for job, result in on("ray").map(work, silent)}
         assert sorted(results.values()) == ["begun before", "rested", "rested"]
-
-
-def wait(condition):
-    end = time.perf_counter() + 240  # on a busy machine
-    while not condition():
-        assert time.perf_counter() < end
-        time.sleep(0.05)
-    return True
