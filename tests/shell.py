@@ -22,3 +22,9 @@ def qfolio(monkeypatch, *arguments):
     with pytest.raises(SystemExit) as exit:
         run()
     return exit.value.code
+
+
+def succeed(*arguments):
+    """Runs a command outside of a test, such as in a fixture that many share."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        assert qfolio(monkeypatch, *arguments) == 0

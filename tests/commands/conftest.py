@@ -2,7 +2,7 @@
 
 import pytest
 
-from shell import qfolio
+from shell import succeed
 from tables import write_table
 
 TINY = ["--set", "window=10", "horizon=20", "hidden=8,8", "num_envs=4", "rollout_length=10"]
@@ -13,10 +13,8 @@ def folder(tmp_path_factory):
     """A finished backtest, made by the command."""
     place = tmp_path_factory.mktemp("backtests")
     prices = write_table(place / "prices.csv")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        code = qfolio(
-            monkeypatch, "backtest", prices, "--agents", "pathwise", "--train", "100d", "--test",
-            "80d", "--seeds", 2, "--episodes", 24, "--out", place / "run", *TINY,
-        )  # fmt: skip
-    assert code == 0
+    succeed(
+        "backtest", prices, "--agents", "pathwise", "--train", "100d", "--test", "80d",
+        "--seeds", 2, "--episodes", 24, "--out", place / "run", *TINY,
+    )  # fmt: skip
     return place / "run"

@@ -11,7 +11,7 @@ import pytest
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.follow import follow
 
-from shell import qfolio
+from shell import qfolio, succeed
 from tables import write_table
 
 DAYS = ["2020-09-16", "2020-10-16", "2020-11-15"]
@@ -32,15 +32,10 @@ def folder(folder, tmp_path_factory):
     """A copy with three monthly allocations, the last of them twice."""
     place = tmp_path_factory.mktemp("follow")
     run = shutil.copytree(folder, place / "run")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        for i, date in enumerate(DAYS):
-            prices = table(place / f"{i}.csv", 260 + 30 * i)
-            for capital in (900, 1000)[i < 2 :]:
-                code = qfolio(
-                    monkeypatch, "allocate", run, "--prices", prices, "--as-of", date,
-                    "--capital", capital,
-                )  # fmt: skip
-                assert code == 0
+    for i, date in enumerate(DAYS):
+        prices = table(place / f"{i}.csv", 260 + 30 * i)
+        for capital in (900, 1000)[i < 2 :]:
+            succeed("allocate", run, "--prices", prices, "--as-of", date, "--capital", capital)
     return run
 
 

@@ -15,7 +15,7 @@ from qfolio.experiments.tuning.run import Tuning
 from qfolio.report import printing
 from qfolio.tasks.pendulum import Pendulum
 
-from shell import TINY, TINY_BACKTEST, qfolio
+from shell import TINY, TINY_BACKTEST, qfolio, succeed
 from tables import write_table
 
 
@@ -23,12 +23,8 @@ from tables import write_table
 def backtest(tmp_path_factory):
     place = tmp_path_factory.mktemp("backtest")
     prices = write_table(place / "prices.csv", rows=160)
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        code = qfolio(
-            monkeypatch, "backtest", prices, *TINY_BACKTEST,
-            "--title", "For the <committee>", "--out", place / "run",
-        )  # fmt: skip
-    assert code == 0
+    title = ("--title", "For the <committee>")
+    succeed("backtest", prices, *TINY_BACKTEST, *title, "--out", place / "run")
     return place / "run"
 
 

@@ -5,7 +5,7 @@ import pytest
 from qfolio.commands.study import _numbers
 from qfolio.portfolio.study.run import Study
 
-from shell import TINY_BACKTEST, qfolio
+from shell import TINY_BACKTEST, qfolio, succeed
 from tables import write_table
 
 
@@ -16,12 +16,7 @@ def place(tmp_path_factory):
     one = write_table(place / "one.csv", rows=160)
     two = write_table(place / "two.csv", rows=160, seed=1)
     short = write_table(place / "short.csv", rows=100, seed=2)
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        code = qfolio(
-            monkeypatch, "study", one, f"other={two}", short, *TINY_BACKTEST,
-            "--out", place / "run",
-        )  # fmt: skip
-    assert code == 0
+    succeed("study", one, f"other={two}", short, *TINY_BACKTEST, "--out", place / "run")
     return place
 
 
