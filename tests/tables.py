@@ -44,9 +44,9 @@ def price_table(
     return Prices(dates, tuple(names[: values.shape[1]]), values, **more)
 
 
-def all_findings(source: Any = None, **options: Any) -> list[Finding]:
-    """All findings on a table."""
-    return inspect(source, **options)[1]
+def findings(source: Any = None, severity: str | None = None, **options: Any) -> list[Finding]:
+    """Findings on a table, of one severity or of all."""
+    return [f for f in inspect(source, **options)[1] if severity in (None, f.severity)]
 
 
 def featured_table(rows: int, features: int, seed: int = 0, drift: float = 0.0) -> Prices:

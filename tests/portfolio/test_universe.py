@@ -33,7 +33,7 @@ from qfolio.portfolio.task import Portfolio
 from qfolio.portfolio.universe import Patterns, spread
 
 from populations import assert_same
-from tables import all_findings, price_table, random_walk, weekdays
+from tables import findings, price_table, random_walk, weekdays
 from tiny import PATHWISE
 
 NAMES = tuple("ABCDEFGH")
@@ -556,7 +556,7 @@ def test_a_table_with_leavers_is_read(tmp_path: Path) -> None:
     frame.loc[frame.index[20:], "C"] = np.nan
     file = tmp_path / "prices.csv"
     frame.to_csv(file)
-    said = " ".join(f"{finding} {finding.advice}" for finding in all_findings(file, late="join"))
+    said = " ".join(f"{finding} {finding.advice}" for finding in findings(file, late="join"))
     assert "no prices after 2024-01-26" in said
     assert "--ended" in said
     prices = load(file, late="join", ended="cash-out", delisting_haircut=0.25)

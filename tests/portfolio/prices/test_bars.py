@@ -10,7 +10,7 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.prices.table import load
 
-from tables import all_findings
+from tables import findings
 
 DAYS = pd.date_range("2024-01-02", periods=5, name="Date")
 KINDS = ["Close", "High", "Low", "Open", "Volume"]
@@ -36,8 +36,8 @@ def as_parquet(folder: Path, frame: pd.DataFrame) -> Path:
     return path
 
 
-def findings(source: object, severity: str) -> list[str]:
-    return [str(f) for f in all_findings(source) if f.severity == severity]
+def notes_on(path: Path) -> list[str]:
+    return [str(finding) for finding in findings(path, "note")]
 
 
 def test_yfinance_in_every_shape(tmp_path: Path):
@@ -74,7 +74,7 @@ def test_adjusted_closes_come_first_and_volumes_may_be_features(tmp_path: Path):
     prices = load(path, features=("Volume",))
     np.testing.assert_array_equal(prices.values, frame["Adj Close"].to_numpy())
     np.testing.assert_array_equal(prices.features[:, :, 0], frame["Volume"].to_numpy())
-    (note,) = findings(path, "note")
+    (note,) = notes_on(path)
     assert note.startswith("prices are those of 'Adj Close AAPL', 'Adj Close OPEN'; left out: ")
 
 
@@ -134,7 +134,7 @@ def test_columns_of_bars(tmp_path: Path, header: str, assets: dict[str, int], no
     path = columns(header, tmp_path)
     prices = load(path)
     assert dict(zip(prices.assets, prices.values[0] - 2 / 8, strict=True)) == assets
-    notes = findings(path, "note")
+    notes = notes_on(path)
     assert len(notes) == (note is not None)
     assert note is None or note in notes[0]
 
@@ -175,7 +175,7 @@ def test_newest_first(tmp_path: Path):
     path = tmp_path / "prices.csv"
     rows = ["2024-01-05,4", "2024-01-04,", "2024-01-03,2", "2024-01-02,1"]
     path.write_text("\n".join(["date,A", *rows]))
-    assert findings(path, "note") == [
+    assert notes_on(path) == [
         "column 'date': the newest row comes first; the rows are read in reverse order"
     ]
     filled = load(path, missing="forward-fill")  # with the price of the day before
@@ -197,7 +197,7 @@ def test_currency_signs(tmp_path: Path):
         load(path)
     rows = [f"{d},{asset},1,{code}\n" for d in days for asset, code in ("AX", "BY")]
     path.write_text("date,asset,price,Currency\n" + "".join(rows))
-    (warning,) = [f for f in all_findings(path) if f.severity == "warning" and f.column]
+    (warning,) = [f for f in findings(path, "warning") if f.column]
     assert str(warning) == "column 'Currency': there are several currencies: X and Y"
     path.write_text("date,A\n" + "".join(f"{d},-$1\n" for d in days))
     with pytest.raises(QfolioError, match="is negative"):

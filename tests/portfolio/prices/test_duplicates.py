@@ -7,7 +7,7 @@ import pandas as pd
 
 from qfolio.portfolio.prices.findings import Finding
 
-from tables import all_findings
+from tables import findings
 
 ROWS, ASSETS = 500, 12
 DAYS = pd.bdate_range("2020-01-01", periods=ROWS)
@@ -23,7 +23,7 @@ def market(assets: int = ASSETS, rows: int = ROWS) -> np.ndarray:
 
 def found(values: np.ndarray) -> list[Finding]:
     frame = pd.DataFrame(values, DAYS, NAMES)
-    return [f for f in all_findings(frame, late="join", ended="cash-out") if "same" in f.message
+    return [f for f in findings(frame, late="join", ended="cash-out") if "same" in f.message
             or "returns" in f.message]  # fmt: skip
 
 
@@ -82,7 +82,7 @@ def test_a_large_table_takes_no_time():
     values[:, 999] = values[:, 0]
     frame = pd.DataFrame(values, pd.bdate_range("2000-01-01", periods=2000)).rename(columns=str)
     start = time.process_time()
-    assert [f.message.partition(":")[0] for f in all_findings(frame)] == [
+    assert [f.message.partition(":")[0] for f in findings(frame)] == [
         "'0' and '999' have the same prices"
     ]
     assert time.process_time() - start < 10  # about one second

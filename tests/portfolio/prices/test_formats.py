@@ -11,7 +11,7 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.prices.table import Prices, load
 
-from tables import all_findings
+from tables import findings
 
 DAYS = pd.bdate_range("2024-01-29", periods=4)
 ISO = [f"{day:%Y-%m-%d}" for day in DAYS]
@@ -38,7 +38,7 @@ def attempt(path: Path, **options: Any) -> Prices | str:
 
 
 def notes(path: Path) -> list[str]:
-    return [str(finding) for finding in all_findings(path) if finding.severity == "note"]
+    return [str(finding) for finding in findings(path, "note")]
 
 
 # Whole tables: a random one in each format.

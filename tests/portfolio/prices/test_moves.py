@@ -8,7 +8,7 @@ import pytest
 
 from qfolio.portfolio.prices.findings import Finding
 
-from tables import all_findings
+from tables import findings
 
 ROWS, AT = 300, 200
 DAYS = pd.bdate_range("2020-01-01", periods=ROWS)
@@ -25,7 +25,7 @@ def market(assets: int = 4, seed: int = 3) -> np.ndarray:
 def found(values: np.ndarray) -> list[Finding]:
     names = [f"A{j}" for j in range(values.shape[1])]
     frame = pd.DataFrame(values, index=DAYS, columns=names)
-    return [f for f in all_findings(frame) if "one asset" not in f.message]
+    return [f for f in findings(frame) if "one asset" not in f.message]
 
 
 @pytest.mark.parametrize(
@@ -49,8 +49,8 @@ def test_a_split_of_the_only_asset_and_one_in_the_last_row():
     values[AT:, 1] *= 0.5
     assert SPLIT in found(values[:, 1:2])[0].message
     names = list("ABCD")
-    findings = all_findings(pd.DataFrame(values[: AT + 1], index=DAYS[: AT + 1], columns=names))
-    assert [f.row for f in findings if SPLIT in f.message] == [AT]
+    said = findings(pd.DataFrame(values[: AT + 1], index=DAYS[: AT + 1], columns=names))
+    assert [f.row for f in said if SPLIT in f.message] == [AT]
 
 
 def crash(values: np.ndarray) -> None:
@@ -152,7 +152,7 @@ def test_a_tick_in_a_crash_and_a_split_after_a_tick():
 
 def test_the_default_table_has_no_bad_ticks_and_one_ratio_of_a_split():
     """Through the crises of 2000 and 2008; a third of a price is a doubtful move in any case."""
-    (split,) = [str(f) for f in all_findings() if f.severity == "warning"]
+    (split,) = map(str, findings(severity="warning"))
     assert split.startswith("row 69 (1990-04-10), column 'RRC': the price is 0.3332 times")
 
 

@@ -17,7 +17,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.prices.findings import Finding
 from qfolio.portfolio.prices.table import Prices, describe, load
 
-from tables import all_findings
+from tables import findings
 
 DAYS = ["2020-01-02", "2020-01-03", "2020-01-06", "2020-01-07", "2020-01-08"]
 A = [10.0, 10.5, 10.25, 10.75, 11.0]
@@ -44,11 +44,11 @@ def wide(**cells: str) -> str:
 
 
 def errors(source: Any, **options: Any) -> list[Finding]:
-    return [f for f in all_findings(source, **options) if f.severity == "error"]
+    return findings(source, "error", **options)
 
 
 def warnings(source: Any, **options: Any) -> list[Finding]:
-    return [f for f in all_findings(source, **options) if f.severity == "warning"]
+    return findings(source, "warning", **options)
 
 
 # What is read.
@@ -350,7 +350,7 @@ def test_unknown_choices_and_columns():
     with pytest.raises(QfolioError, match="missing is 'backward-fill'; did you mean forward-fill"):
         load(frame(), missing="backward-fill")
     with pytest.raises(QfolioError, match="late is 'never'"):
-        all_findings(frame(), late="never")
+        findings(frame(), late="never")
     with pytest.raises(QfolioError, match=r"no column 'volumes' \(did you mean 'volume'"):
         load(frame(A=A, volume=B), features=("volumes",))
     with pytest.raises(QfolioError, match="no column 'day'"):

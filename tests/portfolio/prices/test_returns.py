@@ -1,16 +1,13 @@
 """Returns become prices with the same returns, and are told from prices."""
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.prices.findings import Finding
 from qfolio.portfolio.prices.table import Prices, describe, load
 
-from tables import all_findings, random_walk
+from tables import findings, random_walk
 
 ROWS = 80
 DAYS = pd.bdate_range("2020-01-01", periods=ROWS)
@@ -19,10 +16,6 @@ NAN = np.nan
 
 def prices(seed: int = 0) -> pd.DataFrame:
     return pd.DataFrame(random_walk(ROWS, seed=seed), index=DAYS, columns=list("ABC"))
-
-
-def found(source: Any, severity: str, **options: Any) -> list[Finding]:
-    return [finding for finding in all_findings(source, **options) if finding.severity == severity]
 
 
 def test_returns_of_prices_give_the_prices_back():
@@ -34,7 +27,7 @@ def test_returns_of_prices_give_the_prices_back():
     np.testing.assert_allclose(back.values, expected, rtol=1e-12)
     percent = load(100 * table.pct_change(), returns="percent")
     np.testing.assert_allclose(percent.values, expected, rtol=1e-12)
-    (note,) = found(table.pct_change(), "note", returns="fraction")
+    (note,) = findings(table.pct_change(), "note", returns="fraction")
     assert note.message == "prices are cumulated from returns and start at 100"
 
 
@@ -45,7 +38,7 @@ def test_the_first_return_is_lost_without_the_row_before_it():
     assert len(back) == ROWS - 1
     assert (back.values[0] == 100).all()
     np.testing.assert_allclose(back.relatives, 1 + rates.to_numpy()[1:], rtol=1e-12)
-    (note,) = found(rates, "note", returns="fraction")
+    (note,) = findings(rates, "note", returns="fraction")
     assert "the first row's returns are not used" in note.message
 
 
@@ -94,9 +87,9 @@ def test_returns_that_cannot_be(cell: float, unit: str, message: str):
 
 def test_a_unit_that_is_unlikely():
     rates = prices().pct_change()
-    assert found(rates, "warning", returns="fraction") == []
-    assert found(100 * rates, "warning", returns="percent") == []
-    (warning,) = found(rates, "warning", returns="percent")
+    assert findings(rates, "warning", returns="fraction") == []
+    assert findings(100 * rates, "warning", returns="percent") == []
+    (warning,) = findings(rates, "warning", returns="percent")
     assert (warning.message[:19], warning.advice) == (
         "the usual return is", "Check the unit: perhaps it is fraction."
     )  # fmt: skip
@@ -109,14 +102,14 @@ def test_a_unit_that_is_unlikely():
 def test_returns_are_told_from_prices():
     rates = prices().pct_change().iloc[1:]
     for table in (rates, 100 * rates):
-        (error,) = found(table, "error")
+        (error,) = findings(table, "error")
         assert error.message.startswith("the numbers look like returns: ")
         assert error.advice == (
             "Give prices, or choose returns='percent' or 'fraction' (--returns)."
         )
     table = prices()
     table.iloc[5, 1] = -1
-    (error,) = found(table, "error")
+    (error,) = findings(table, "error")
     assert error.message == "the price is negative"
 
 
