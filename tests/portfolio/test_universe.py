@@ -13,7 +13,7 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Discrete, Position, Transition
-from qfolio.experiments.presets import Preset, preset
+from qfolio.experiments.presets import preset
 from qfolio.portfolio.anchors import path
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.folds import Fold
@@ -34,16 +34,9 @@ from qfolio.portfolio.universe import Patterns, spread
 
 from populations import assert_same
 from tables import findings, price_table, random_walk, weekdays
-from tiny import PATHWISE
+from tiny import DQN, PATHWISE
 
 NAMES = tuple("ABCDEFGH")
-MENU = Preset(
-    "dqn",
-    {"network": "mlp", "hidden": (4,), "num_envs": 4, "batch_size": 8, "learning_starts": 40,
-     "all_actions": True, "replay_capacity": 400, "episode_steps": 0},
-    episodes=8, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
-)  # fmt: skip
-
 SIGNALS = {"signals": "momentum:5,volatility:5", "anchor": "equal-weight"}
 
 
@@ -400,7 +393,7 @@ def test_limits_of_every_set_of_assets_can_be_met() -> None:
 def test_a_mandate_in_motion_is_said_and_checked_over_a_whole_backtest(tmp_path: Path) -> None:
     prices, _ = moving(4, 160, 4, haircut=0.2)
     backtest = Backtest.create(
-        prices, {"pathwise": PATHWISE, "dqn": MENU}, train="100d", test="30d", seeds=1,
+        prices, {"pathwise": PATHWISE, "dqn": DQN}, train="100d", test="30d", seeds=1,
         out=tmp_path / "run", baselines=["momentum"], mandate=LIMITS,
         strategies={"mine": frame_of_weights(prices)},
     )  # fmt: skip

@@ -15,24 +15,15 @@ from qfolio.experiments.executor import Here
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.processes import Processes
-from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.kept import LATEST
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.study.run import Study
 
 from listeners import Interrupt
 from tables import price_table, random_walk
-from tiny import PATHWISE
+from tiny import DQN, PATHWISE
 
 AGENTS = {"pathwise": PATHWISE}
-DQN = {
-    "dqn": Preset(
-        "dqn",
-        {"network": "mlp", "hidden": (8,), "all_actions": True, "num_envs": 4,
-         "batch_size": 8, "learning_starts": 40, "replay_capacity": 400, "episode_steps": 0},
-        episodes=16, seeds=2, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
-    ),
-}  # fmt: skip
 
 
 def table(seed=0):
@@ -139,7 +130,7 @@ def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
     """Groups of folds differ with the cores of a worker; what is learned does not."""
     found: list[dict[str, bytes]] = []
     for executor in (Here(), Processes(1), Processes(2, cores=1)):
-        backtest = create(tmp_path / f"{len(found)}", AGENTS | DQN)
+        backtest = create(tmp_path / f"{len(found)}", AGENTS | {"dqn": DQN})
         backtest.run(executor=executor)
         found.append(files(backtest.folder))
     assert found[0] == found[1] == found[2]

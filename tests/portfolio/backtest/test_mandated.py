@@ -21,6 +21,7 @@ from qfolio.portfolio.mandate.limits import buyable, feasible
 from qfolio.portfolio.prices.table import Prices
 
 from tables import price_table, random_walk
+from tiny import DQN
 
 ASSETS = ("A", "B", "C", "D", "E")
 
@@ -36,12 +37,7 @@ AGENTS = {
         "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (8, 8)},
         episodes=8, seeds=2, task={"window": 10, "horizon": 20},
     ),
-    "dqn": Preset(
-        "dqn",
-        {"network": "mlp", "hidden": (8, 8), "all_actions": True, "num_envs": 4,
-         "batch_size": 8, "learning_starts": 40, "replay_capacity": 400, "episode_steps": 0},
-        episodes=8, seeds=2, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
-    ),
+    "dqn": DQN._replace(episodes=8),
 }  # fmt: skip
 
 

@@ -29,14 +29,10 @@ from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices
 
 from listeners import Interrupt, Tell
 from tables import price_table, random_walk, write_table
+from tiny import DQN, with_task
 
 AGENTS = {
-    "dqn": Preset(
-        "dqn",
-        {"network": "mlp", "hidden": (8, 8), "all_actions": True, "num_envs": 4,
-         "batch_size": 8, "learning_starts": 40, "replay_capacity": 400, "episode_steps": 0},
-        episodes=16, seeds=2, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
-    ),
+    "dqn": DQN,
     "pathwise": Preset(
         "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (8, 8)},
         episodes=24, seeds=2, task={"window": 10, "horizon": 20},
@@ -64,7 +60,7 @@ def create(folder=None, prices=None, agents=AGENTS, **settings):
 
 def changed(name, **task):
     """An agent alone, with other settings of the task."""
-    return {name: AGENTS[name]._replace(task={**AGENTS[name].task, **task})}
+    return {name: with_task(AGENTS[name], **task)}
 
 
 @pytest.fixture(scope="module")
@@ -467,8 +463,7 @@ def test_episodes_are_shorter_where_a_fold_is_short(tmp_path):
 
 
 def test_a_signal_that_no_training_row_has_is_named():
-    long = AGENTS["pathwise"]
-    agents = {"pathwise": long._replace(task={**long.task, "signals": "momentum:5,momentum:150"})}
+    agents = changed("pathwise", signals="momentum:5,momentum:150")
     run = create(train="100d", test="100d", agents=agents, seeds=1)
     assert notes.unknown(run.tasks, run.folds) == [
         "momentum:150 looks back on more rows than 1 of 2 folds has for training; there it is "

@@ -8,14 +8,13 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.statistics import holm
 from qfolio.experiments.executor import Here
 from qfolio.portfolio.backtest.folds import require_fold
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.study.folder import Variant
 from qfolio.portfolio.study.run import Study, corrected, summarize
 
 from listeners import Interrupt
 from studies import made_up, study
-from tables import price_table, random_walk
-from tiny import PATHWISE
+from tables import days, price_table, random_walk
+from tiny import PATHWISE, with_task
 
 AGENTS = {"pathwise": PATHWISE}
 
@@ -236,11 +235,8 @@ def test_short_tables_are_left_out_with_a_reason(tmp_path):
 
 def test_tables_too_short_for_an_agent_are_left_out(tmp_path):
     """At two of the lags it is long enough, and the backtests there do not stay."""
-    agent = AGENTS["pathwise"]
-    agent = agent._replace(task={**agent.task, "window": 60, "horizon": 10})
-    weeks = table(3)
-    weeks = Prices(weeks.dates[0] + np.arange(len(weeks)) * np.timedelta64(7, "D"), weeks.assets,
-                   weeks.values)  # fmt: skip
+    agent = with_task(PATHWISE, window=60, horizon=10)
+    weeks = price_table(table(3).values, dates=days(7 * 160)[::7])
     made = Study.create(
         {"days": table(0, rows=700), "weeks": weeks}, {"p": agent}, out=tmp_path / "part",
         lags=(1, 2, 9), train="18m", test="3m", seeds=1, baselines=[],
