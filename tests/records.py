@@ -6,10 +6,6 @@ from numpy.typing import ArrayLike
 from qfolio.portfolio.backtest.statistics.assessment import Strategy
 
 
-def days(count: int) -> np.ndarray:
-    return np.datetime64("2001-01-01") + np.arange(count, dtype="m8[D]")
-
-
 def strategy(
     rng: np.random.Generator, kind: str = "agent", seeds: int = 3, count: int = 300
 ) -> Strategy:

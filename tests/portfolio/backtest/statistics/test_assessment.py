@@ -17,7 +17,8 @@ from qfolio.portfolio.backtest.statistics.sharpe import (
     probabilistic_sharpe,
 )
 
-from records import days, record, strategy
+from records import record, strategy
+from tables import days
 
 
 def test_assess_by_hand_on_one_block() -> None:

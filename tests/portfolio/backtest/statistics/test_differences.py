@@ -10,7 +10,8 @@ from qfolio.portfolio.backtest.statistics.assessment import Assessment, Strategy
 from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference, tails_to
 from qfolio.portfolio.backtest.statistics.estimates import Estimate, Tails
 
-from records import days, strategy
+from records import strategy
+from tables import days
 
 NU = 400
 

@@ -16,7 +16,7 @@ from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.backtest.statistics.assessment import Assessment, Strategy, assess
 
-from records import days
+from tables import days
 
 ASSETS, ROWS, YEAR = 6, 757, 252
 

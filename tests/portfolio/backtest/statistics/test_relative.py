@@ -11,6 +11,8 @@ from qfolio.portfolio.backtest.statistics.relative import (
     relative,
 )
 
+from tables import days
+
 RETURNS = np.array([0.03, -0.02, 0.01, 0.0])
 OTHER = np.array([0.02, -0.01, 0.02, -0.01])
 
@@ -71,7 +73,6 @@ def test_histories_are_measured_as_the_days_that_they_draw() -> None:
 
 def test_an_assessment_compares_with_its_reference() -> None:
     rng = np.random.default_rng(1)
-    dates = np.datetime64("2001-01-01") + np.arange(60, dtype="m8[D]")
 
     def made(kind: str, seeds: int, known: bool = True) -> Strategy:
         returns = rng.normal(0, 0.01, (seeds, 60))
@@ -83,7 +84,7 @@ def test_an_assessment_compares_with_its_reference() -> None:
         "index": made("baseline", 1, known=False), "mine": made("strategy", 1),
         "equal": made("baseline", 1), "dqn": made("agent", 3),
     }  # fmt: skip
-    found = assess(strategies, dates, periods_per_year=252, reference="index", resamples=50)
+    found = assess(strategies, days(60), periods_per_year=252, reference="index", resamples=50)
     assert found.trials == 1 + 3
     assert found.strategies["index"].relative == {}
     assert math.isnan(found.strategies["index"].measures["turnover"].mean)
@@ -98,7 +99,7 @@ def test_an_assessment_compares_with_its_reference() -> None:
             low, high = entry.relative[key].over_time
             assert low < high
         assert math.isnan(entry.relative["active_share"].mean)
-    again = assess(strategies, dates, periods_per_year=252, reference="equal", resamples=50)
+    again = assess(strategies, days(60), periods_per_year=252, reference="equal", resamples=50)
     mine, equal = (strategies[name].weights for name in ("mine", "equal"))
     assert mine is not None
     assert equal is not None

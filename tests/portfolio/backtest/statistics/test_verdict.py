@@ -11,7 +11,8 @@ from qfolio.portfolio.backtest.statistics.assessment import Assessment, assess
 from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference
 from qfolio.portfolio.backtest.statistics.verdict import bound_sentence, luck, p_text, verdicts
 
-from records import days, strategy
+from records import strategy
+from tables import days
 
 
 def text(sentence: str) -> str:
