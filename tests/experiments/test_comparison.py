@@ -77,12 +77,6 @@ def short_chunks():
         yield
 
 
-@pytest.fixture
-def one_core(monkeypatch):
-    """The programs of these tests are hardly optimized, and round differently on two."""
-    monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
-
-
 GOOD, ALIKE, BAD = np.arange(8) / 8 - 102, np.arange(8) / 8 - 102.05, np.arange(8) - 140.0
 
 

@@ -1,6 +1,5 @@
 """Runs whose seeds train in groups: the same as all of them side by side, to the bit."""
 
-import jax
 import pytest
 
 from qfolio.core.errors import QfolioError
@@ -16,12 +15,7 @@ from populations import assert_same
 from shell import TINY, qfolio
 
 EPISODES, SEEDS = 12, 3
-
-
-@pytest.fixture(autouse=True)
-def one_core(monkeypatch):
-    """Programs that are hardly optimized, as those of the quick tests, round differently on two."""
-    monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
+pytestmark = pytest.mark.usefixtures("one_core")
 
 
 def start(task, agent, out=None, **changes):
