@@ -7,10 +7,10 @@ from unittest.mock import Mock
 import pandas as pd
 import pytest
 
-from qfolio import cli
 from qfolio.portfolio.prices import delimited
 from qfolio.portfolio.prices.table import load
 
+from shell import qfolio
 from tables import random_walk
 
 
@@ -25,10 +25,7 @@ def table(path: Path, rows: int, assets: int) -> Path:
 def test_a_check_reads_the_table_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     parse = Mock(wraps=delimited._parse)
     monkeypatch.setattr(delimited, "_parse", parse)
-    monkeypatch.setattr("sys.argv", ["qfolio", "prices", str(table(tmp_path / "a.csv", 80, 3))])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert not end.value.code
+    assert qfolio(monkeypatch, "prices", table(tmp_path / "a.csv", 80, 3)) == 0
     parse.assert_called_once()
 
 
