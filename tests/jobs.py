@@ -119,6 +119,7 @@ class Pretended:
     def __init__(self):
         self.budget, self.config, self.begun, self.left = Budget(episodes=4), {"job": "x"}, 0, 4
         self.seconds, self.steps_per_second, self.seconds_left, self.members = 1.0, 7.0, 3.0, [0]
+        self.ends = [100]
 
     @property
     def share(self):

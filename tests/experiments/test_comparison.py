@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
+from qfolio.agents.ppo import PPO
 from qfolio.commands.progress import JobsProgress
 from qfolio.core.errors import QfolioError
+from qfolio.core.statistics import interquartile_mean
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
-from qfolio.experiments.comparison.conclusion import conclusion, share
+from qfolio.experiments.comparison.conclusion import amount, conclusion, share
+from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.operations import operations_per_step
 from qfolio.experiments.comparison.ranking import (
     Result,
@@ -175,6 +178,40 @@ def test_agents_with_equal_results_end_level():
     assert len(said) == 2
 
 
+def test_an_agent_whose_seeds_mostly_end_better_is_named():
+    """The one with the best interquartile mean can lose most pairs of seeds."""
+    ahead = -101 - np.arange(15) / 100
+    ahead[11:] = -1e8
+    said = conclusion(rank({"a": result(ahead), "b": result(-102 - np.arange(15) / 100)}))
+    assert said[0].startswith("b ends nearest")
+    assert said[1].startswith("Most seeds of a (")
+    assert "told apart" not in " ".join(said)
+
+
+def test_agents_that_are_as_quick_are_named_together():
+    twins = {"a": result(GOOD), "b": result(ALIKE), "c": result(BAD, curve=(-300.0,) * 3)}
+    assert conclusion(rank(twins))[-1].startswith(
+        "To settle within 10% of the optimum, a and b need the fewest steps (1,000) and the least "
+        "time ("
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(999.96, "1,000"), (999.94, "999.9"), (1234.4, "1,234"), (0.5, "0.5")]
+)
+def test_amounts(value, text):
+    assert amount(value) == text
+
+
+def test_a_critic_is_no_part_of_the_policy():
+    agent = PPO(num_envs=2, rollout_length=10, batch_size=20, epochs=1, hidden=(8,))
+    run = Run.create(Pendulum(**TASK), agent, episodes=2)
+    run.train()
+    measured = measure(run, 1)
+    assert measured.parameters == 3 * 8 + 8 + 8 * 11 + 11
+    assert measured.policy_bytes == 4 * measured.parameters
+
+
 def test_a_best_return_of_zero_has_no_shares():
     ranking = rank({name: result([0.0, 0.0], curve=(0.0, 0.0), optimum=None) for name in "ab"})
     assert [entry["reached"] for entry in ranking["agents"]["a"]["within"]] == [0] * 6
@@ -245,7 +282,8 @@ def test_a_comparison_shows_itself_in_a_notebook(finished):
     assert "2 of 2 agents" in shown
     for name in ("slow", "quick"):
         assert f"<td>{name}</td>" in shown
-        assert f"{np.mean(content['results'][name]['returns']):,.4g}" in shown
+        middle = float(interquartile_mean(content["results"][name]["returns"]))
+        assert f"{middle:,.4g}" in shown
 
 
 def test_a_comparison_in_its_folder(finished):
@@ -556,12 +594,12 @@ def test_reports_of_hard_cases():
     exact = result([-100.0], curve=(-100.0,) * 3)
     above = result([-99.5], curve=(-400.0, -100.0, -99.0))
     text = page({"exact": exact, "above": above})
-    assert re.search(r"<td class=\"lead\">\N{MINUS SIGN}0.50", text)
+    assert re.search("above</th>\\s*<td>\N{MINUS SIGN}0.50", text)
     assert not re.search(r"\bnan\b|\binf\b", text)
     # More agents than colors, with budgets from ten steps to ten million.
     many = {f"agent{i}": result(GOOD[:2] - i, steps=10**i) for i in range(1, 8)}
     text = page(many)
-    assert text.count('stroke-dasharray="7 3"') == 4  # the seventh, in each table and list
+    assert text.count('stroke-dasharray="8 3"') == 4  # the seventh, in each table and list
     assert '<th scope="col" title="agent7">7</th>' in text
     # No optimum.
     unknown = {

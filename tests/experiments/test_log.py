@@ -6,10 +6,13 @@ from time import perf_counter, process_time
 import numpy as np
 import pytest
 
+from qfolio.agents.ppo import PPO
 from qfolio.core.errors import QfolioError
+from qfolio.core.population import Population
 from qfolio.experiments import log as logs
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.events import EVENTS, read
+from qfolio.experiments.fit import fit
 from qfolio.experiments.log import Log, Tracker, means, tracked
 from qfolio.experiments.machines.messages import Report
 from qfolio.experiments.machines.remote import RemoteTraining, hear
@@ -17,7 +20,7 @@ from qfolio.experiments.records import Records
 from qfolio.experiments.run import Run
 
 from listeners import Interrupt
-from probes import Explosive
+from probes import Endless, Explosive
 
 
 def logged(folder, kind=None):
@@ -68,9 +71,11 @@ def test_a_long_chunk_makes_several_records(task, agent, tmp_path):
     run = Run.create(task, agent, steps=400, seeds=1, out=tmp_path / "run")
     run.train()
     records = [r for r in logged(tmp_path / "run", "record") if "return" in r["values"]]
-    assert len(records) == len(run.metrics)  # few episodes: a record each
+    # Few episodes: a record for those of both environments.
+    assert len(records) * agent.num_envs == len(run.metrics)
+    returns = run.metrics.column("return").reshape(-1, agent.num_envs).mean(1)
     assert [r["values"]["return"] for r in records] == [
-        [pytest.approx(row["return"], rel=1e-5)] for row in run.metrics
+        [pytest.approx(each, rel=1e-5)] for each in returns.tolist()
     ]
     steps = [r["step"] for r in records]
     assert steps == sorted(set(steps))
@@ -128,11 +133,11 @@ def test_a_member_without_an_episode_has_no_mean():
     }
 
 
-def report(hook, seconds=1.0, left=0, rows=(), members=()):
+def report(hook, seconds=1.0, left=0, rows=(), members=(), ends=()):
     """What a worker says of a training."""
     share, where = 1.0 if not left else 0.5, "process 7 on far"
     return Report(hook, where, Budget(4), {}, 0, left, 100, seconds, share, 7.0, 3.0,
-                  Records.of(rows), [*members])  # fmt: skip
+                  Records.of(rows), [*members], [*ends])  # fmt: skip
 
 
 def test_jobs_on_workers_are_logged_by_the_driver(tmp_path):
@@ -140,7 +145,12 @@ def test_jobs_on_workers_are_logged_by_the_driver(tmp_path):
         log.queue(["a"])
         job = log.job("a", ["seed 0"])
         hear(report("on_start", left=2), job)
-        hear(report("on_chunk", rows=[{"seed": 0, "episode": 1, "return": 2.5}], members=[0]), job)
+        hear(
+            report(
+                "on_chunk", rows=[{"seed": 0, "episode": 1, "return": 2.5}], members=[0], ends=[4]
+            ),
+            job,
+        )
         hear(report("on_end"), job)
     names = [event["event"] for event in logged(tmp_path)]
     assert names == ["start", "queued", "running", "record", "done", "end"]
@@ -156,6 +166,24 @@ def test_the_file_is_touched_while_a_process_works(tmp_path, monkeypatch):
         started = perf_counter()
         while (tmp_path / EVENTS).stat().st_mtime < 1000:
             assert perf_counter() - started < 10
+
+
+@pytest.mark.parametrize("environments", [1, 300])
+def test_a_record_has_every_member_and_the_step_of_its_episodes(tmp_path, environments):
+    """Environments of all members end their episodes at the same step."""
+    agent = PPO(
+        num_envs=environments, rollout_length=4, batch_size=4 * environments, epochs=1, hidden=(4,)
+    )
+    population = Population(Endless(horizon=4), agent, [0, 1, 2])
+    with Log(tmp_path).opened(kind="run") as log:
+        fit(population, Budget(50 * environments), [log.job(members=["a", "b", "c"])])
+    records = logged(tmp_path, "record")
+    assert len(records) > 10
+    for record in records:
+        assert record["step"] % (4 * environments) == 0
+        episode = record["values"]["episode"]
+        assert episode == [record["step"] / 4] * 3
+        assert record["share"] == pytest.approx(episode[0] / (50 * environments), abs=1e-3)
 
 
 def test_trackers_hear_means_over_members(tmp_path):
@@ -190,7 +218,7 @@ def test_logging_takes_little_of_a_training(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(logs, "perf_counter", lambda: now[0])
     members = [i % 8 for i in range(10)]
-    training = RemoteTraining(report("on_chunk", left=2, members=members))
+    training = RemoteTraining(report("on_chunk", left=2, members=members, ends=[100] * 10))
     row = dict.fromkeys(("seed", "episode", "return", "loss", "q"), 1.0)
     rows = Records.of([row] * 10)
     begun, chunks = process_time(), 20_000

@@ -47,14 +47,16 @@ def test_episodes_are_counted_for_each_member_in_order_of_time():
     finished = draw.random((3, 40, 4)) < 0.3
     finished[1] = False
     returns = draw.normal(size=finished.shape).astype(np.float32)
-    records, members = _records(
+    records, members, times = _records(
         [7, 8, 9], [10, 20, 30], Episodes(jnp.array(finished), jnp.array(returns), {})
     )
-    count, expected = [10, 20, 30], []
+    count, expected, ends = [10, 20, 30], [], []
     for time, member, environment in np.ndindex(40, 3, 4):
         if finished[member, time, environment]:
             count[member] += 1
+            ends.append(time)
             value = float(returns[member, time, environment])
             expected.append({"seed": 7 + member, "episode": count[member], "return": value})
     assert records == expected
     assert members == [row["seed"] - 7 for row in expected]
+    assert times.tolist() == ends

@@ -26,7 +26,7 @@ from qfolio.experiments.run import Run
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Trial, best_of
 from qfolio.experiments.tuning.run import Progress, Tuning, tuning_keys
-from qfolio.experiments.tuning.search import dimension
+from qfolio.experiments.tuning.search import dimension, positions
 from qfolio.experiments.tuning.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
 from qfolio.experiments.tuning.trials import trials_jobs
 from qfolio.report.figures.tuning import draw_progress
@@ -515,6 +515,11 @@ def test_sensitivity_admits_what_it_does_not_know():
     space, trials = made_up(ENOUGH - 1)
     assert sensitivity(space, trials, -100.0) is None
     assert "trials with a finite loss are needed" in verdicts(None, trials)[0]
+    alike = [trial._replace(returns=(1.0, 1.0)) for trial in made_up(20)[1]]
+    assert sensitivity(space, alike, None) is None
+    assert verdicts(None, alike) == [
+        "All trials ended alike: within the searched ranges no setting matters."
+    ]
     space, trials = made_up(30)
     draw = np.random.default_rng(1)
     noise = [trial._replace(returns=(float(draw.normal()),)) for trial in trials]
@@ -526,11 +531,29 @@ def test_sensitivity_admits_what_it_does_not_know():
 def test_outcomes():
     known = Outcome.of([-200.0, -110.0, math.nan], optimum=-100.0)
     heights = known.height([-200.0, -110.0, math.nan, -101.0])
-    np.testing.assert_allclose(heights, [0.0, 1.0, 0.0, 2.0], atol=1e-12)
-    np.testing.assert_allclose(known.loss(heights), [1.0, 0.1, 1.0, 0.01])
+    failed = 1.1  # worse than the worst by more than what is tolerated
+    np.testing.assert_allclose(heights, [0.0, 1.0, -np.log10(failed), 2.0], atol=1e-12)
+    np.testing.assert_allclose(known.loss(heights), [1.0, 0.1, failed, 0.01])
     unknown = Outcome.of([1.0, 2.0, 3.0, -1e9], optimum=None)
     assert unknown.floor == 3 - 3 * 1.5
-    np.testing.assert_allclose(unknown.height([2.0, math.nan, -1e9]), [2.0, -1.5, -1.5])
+    np.testing.assert_allclose(unknown.height([2.0, math.nan, -1e9]), [2.0, -1.8, -1.5])
+
+
+@pytest.mark.parametrize("optimum", [-100.0, None])
+def test_trials_that_diverged_are_not_near_the_best(optimum):
+    """The others all lie within the tolerance of the best."""
+    space, trials = made_up(40)
+    learning_rate = np.array([positions(space, trial.values)[0] for trial in trials])
+    trials = [
+        trial._replace(returns=(math.nan if place > 0.8 else -102.0 - place,) * 2, at_random=True)
+        for trial, place in zip(trials, learning_rate, strict=True)
+    ]
+    finite = int((learning_rate <= 0.8).sum())
+    found = sensitivity(space, trials, optimum)
+    assert f"Of 40 configurations drawn at random, {finite} lost" in verdicts(found, trials)[0]
+    assert found is not None
+    (effect,) = (each for each in found.effects if each.dimension is space[0])
+    assert effect.range[1] < 0.95
 
 
 @pytest.mark.parametrize(

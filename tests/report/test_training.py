@@ -492,7 +492,7 @@ def test_market_report(tmp_path: Path) -> None:
     text = text_of((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert "Three agents reached a mean log growth of 0.1905 over 480 steps (95% interval" in text
     assert "0.7% below the exact optimum of 0.1920" in text
-    assert "Growth a year 0.476% exact: 0.480%" in text
+    assert "Growth a year 0.476% exact policy: 0.480%" in text
     assert "low 0.410 0.420 0.450" in text  # exact, mean, farthest
     assert "high at -0.2 0.590 0.590 0.600" in text
     assert "3 0.1897 1.19% Mean" in text
@@ -627,6 +627,9 @@ def test_key_figures_count_all_seeds() -> None:
     for unit, each in (("episodes", "400 episodes each"), ("steps", "80,000 steps each")):
         text = text_of(render_page(replace(data, unit=unit, maps=None, episode=None)))
         assert f"Environment steps 640,000 all seeds, {each}" in text
+    summary = {**data.summary, "episodes_per_seed": [430, 400, 512]}
+    text = text_of(render_page(replace(data, summary=summary, maps=None, episode=None)))
+    assert "all seeds, 400 to 512 episodes each" in text
     one = replace(make_data(seeds=1, points=3, steps=1), maps=None, episode=None)
     assert "Environment steps 80,000 400 episodes Learning" in text_of(render_page(one))
 

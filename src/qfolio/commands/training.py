@@ -68,9 +68,9 @@ def train(
             double-q or dyna-q; for markets pathwise; or your own as module:Name.
         preset: Preset of the agent (default: fast). DQN on the pendulum also has best, categorical,
             rainbow and report (the settings of the report that qfolio grew out of).
-        episodes: Training episodes of each seed, or a few more where environments side by side
-            finish theirs together (default: the preset's number). Episodes of DQN's presets fast
-            and best are short: 28 and 40 steps.
+        episodes: Training episodes of each seed, or more: seeds train side by side until each has
+            as many (default: the preset's number). Episodes of DQN's presets fast and best are
+            short: 28 and 40 steps.
         steps: Environment steps of each seed, instead of episodes.
         seeds: Number of seeds trained side by side (default: the preset's number).
         seed: First seed; the others follow it (default: 0).

@@ -32,6 +32,7 @@ class Training:
         left: Remaining steps of each environment.
         seconds: Time spent on training, excluding compilation.
         members: The member that each row of the last chunk belongs to.
+        ends: The steps of all environments of a member at the end of each row's episode.
         interrupted: Whether Ctrl-C asked the training to stop.
         where: The worker that the training runs on; empty in this process.
     """
@@ -43,6 +44,7 @@ class Training:
     left: int = 0
     seconds: float = 0.0
     members: Sequence[int] = ()
+    ends: Sequence[int] = ()
     interrupted: bool = False
     where: str = ""
     _learned: int = 0  # steps of each environment since learning began, and their time
@@ -99,7 +101,8 @@ class Training:
         self.left = self.budget.left(population)
         if not strict and not any(population.healthy):
             self.left = 0
-        rows, self.members = _records(population.seeds, episodes, records)
+        rows, self.members, times = _records(population.seeds, episodes, records)
+        self.ends = ((steps + 1 + times) * population.agent.num_envs).tolist()
         return rows
 
 
@@ -165,8 +168,8 @@ def fit(
 
 def _records(
     seeds: Sequence[int], before: Sequence[int], episodes: Episodes
-) -> tuple[Records, list[int]]:
-    """A row for each finished episode and its member, in order of time.
+) -> tuple[Records, list[int], np.ndarray]:
+    """A row for each finished episode, its member and its time in the chunk, in order of time.
 
     before: finished episodes of each member until now.
     """
@@ -180,4 +183,4 @@ def _records(
     columns = {"seed": np.array(seeds)[member], "episode": number}
     for name, values in {"return": episodes.returns, **episodes.metrics}.items():
         columns[name] = np.asarray(values[member, time, environment], float)
-    return Records(columns), member.tolist()
+    return Records(columns), member.tolist(), time

@@ -29,7 +29,7 @@ PARTS = 50
 """Minimum number of records of a training with enough episodes; long chunks are split."""
 
 RECENT = 500
-"""Maximum number of latest episodes in a record's means; four per member if that is more."""
+"""A record's means are of the latest episodes: so many, or more that ended at the same step."""
 
 
 class Tracker:
@@ -170,6 +170,7 @@ class JobLog(Listener):
         self.log, self.name, self.members = log, name, list(members)
         self._rows: list[Records] = []  # of each chunk
         self._of: list[int] = []  # the member of each row
+        self._ends: list[int] = []  # the step at which the episode of each row ended
         self._due = 0.0
         self._step, self._share = 0, 0.0  # of the previous record
 
@@ -187,6 +188,7 @@ class JobLog(Listener):
     def on_chunk(self, training: Training, rows: Records) -> None:
         self._rows.append(rows)
         self._of += training.members
+        self._ends += training.ends
         if perf_counter() >= self._due:
             self._flush(training)
             apart = min(max(SHORTEST, SHARE * training.seconds), LONGEST)
@@ -204,21 +206,35 @@ class JobLog(Listener):
         self.log.track(self.name, step, values)
 
     def _flush(self, training: Training) -> None:
-        rows, members = Records.joined(self._rows), self._of
-        most = max(RECENT, 4 * len(self.members))
+        rows, members, ends = Records.joined(self._rows), self._of, self._ends
         step, share = training.steps, training.share
-        parts = max(1, min(math.ceil(PARTS * (share - self._share)), len(rows)))
-        for part in range(parts):  # in order of time, as the rows are
-            last, done = len(rows) * (part + 1) // parts, (part + 1) / parts
-            some = slice(max(len(rows) * part // parts, last - most), last)
+        for some in _parts(ends, math.ceil(PARTS * (share - self._share))):
+            at = step if some.stop == len(rows) else ends[some.stop - 1]
+            done = (at - self._step) / max(step - self._step, 1)
             self.record(
-                self._step + round((step - self._step) * done),
+                at,
                 means(rows[some], members[some], len(self.members)),
                 share=round(self._share + (share - self._share) * done, 4),
                 rate=round(training.steps_per_second, 1),
                 left=round(training.seconds_left, 1),
             )
-        self._rows, self._of, self._step, self._share = [], [], step, share
+        self._rows, self._of, self._ends, self._step, self._share = [], [], [], step, share
+
+
+def _parts(ends: Sequence[int], count: int) -> list[slice]:
+    """The latest rows of each of ``count`` parts of some rows, or fewer.
+
+    Rows whose episodes end at the same step stay together: they are of several members.
+    """
+    if not ends:
+        return [slice(0, 0)]
+    count, found, begin = max(1, min(count, len(ends))), [], 0
+    last = [ends[len(ends) * (part + 1) // count - 1] for part in range(count)]
+    for stop in np.unique(np.searchsorted(ends, last, "right")).tolist():
+        recent = int(np.searchsorted(ends, ends[max(stop - RECENT, 0)]))
+        found.append(slice(max(begin, recent), stop))
+        begin = stop
+    return found
 
 
 def means(rows: Records, members: Sequence[int], count: int) -> dict[str, list[float | None]]:

@@ -202,6 +202,7 @@ class Run(Seeds):
             "preset": config.preset,
             "seeds": config.seeds,
             "episodes": self.episodes,
+            "episodes_per_seed": self.population.member_episodes,
             "env_steps": steps,
             "seconds_compile": round(self.population.seconds_compile, 3),
             "seconds_train": round(self.seconds_train, 3),

@@ -298,7 +298,10 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
             ("Exact optimum", tidy(amount(optimum)), f"on {number(data.starts, 0)} fixed starts")
         )
     final = data.write(ranking["agents"][first]["final"]["iqm"])
-    facts.append(("Lowest regret" if data.graded else "Highest return", final, first))
+    results_of = {name: entry["final"]["per_seed"] for name, entry in ranking["agents"].items()}
+    level = [name for name in ranking["order"] if results_of[name] == results_of[first]]
+    best = "Lowest regret" if data.graded else "Highest return"
+    facts.append((best, final, first if len(level) == 1 else f"{len(level)} agents"))
     if arrived:
         frugal = min(arrived, key=lambda name: arrived[name]["steps"])
         quick = min(arrived, key=lambda name: arrived[name]["seconds"])
@@ -400,6 +403,6 @@ def _settings(data: ComparisonData, name: str) -> tuple[str, list[Any]]:
     """A line on an agent's training, and all its settings by group."""
     entry, result = data.content["agents"][name], data.results[name]
     preset = f"preset {entry['preset']}, " if entry["preset"] else ""
-    line = f"{entry['agent']}, {preset}{rendering.amount(result.episodes)} episodes a seed"
+    line = f"{entry['agent']}, {preset}at least {rendering.amount(result.episodes)} episodes a seed"
     groups = {"agent": entry["agent_settings"], "task": entry["task_settings"]}
     return line, setting_groups(groups)

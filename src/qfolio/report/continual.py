@@ -112,7 +112,7 @@ def _row(content: Content, way: str) -> list[tuple[str, str]]:
     course, recovery = content["courses"][way], content["recovery"][way]
     reached = sum(step is not None for step in recovery["per_seed"])
     middle = recovery["middle"]
-    seconds = course["seconds"] / content["seeds"]
+    seconds = course["seconds"]
     return [
         (percent(_middle(content, way)), f"worst {percent(max(course['final']))}"),
         ("–" if middle is None else amount(round(middle)), f"{reached} of {content['seeds']}"),

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,8 @@ def _distance(summary: dict[str, Any]) -> str:
     if summary["optimum"] is None:
         return ""
     optimum, regret = number(summary["optimum"], _digits(summary)), _mean_regret(summary)
+    if not math.isfinite(regret):  # the optimum is 0
+        return f", where the exact optimum is {optimum}"
     share = percent(abs(regret))
     if share == percent(0):
         return f", equal to the exact optimum of {optimum} within a tenth of a percent"
@@ -134,7 +137,8 @@ def _facts(
     seeds = len(summary["return_per_seed"])
     digits = _digits(summary)
     together = "all seeds together" if seeds > 1 else "while training"
-    done = f"{amount(summary['episodes'])} episodes"
+    counts = summary.get("episodes_per_seed", [summary["episodes"]])
+    done = " to ".join(amount(x) for x in sorted({min(counts), max(counts)})) + " episodes"
     if seeds > 1:
         each = amount(summary["env_steps"]) + " steps" if unit == "steps" else done
         done = f"all seeds, {each} each"
@@ -165,7 +169,7 @@ def _facts(
     if market and market.period:
         learned, best = (summary[name] / market.periods for name in ("return_mean", "optimum"))
         fine = decimals(100 * best, 3)
-        exact = f"exact: {percent(best, fine)}"
+        exact = f"exact policy: {percent(best, fine)}"
         facts.remove(speed)
         facts.insert(3, (f"Growth a {market.period}", percent(learned, fine), exact))
     return facts

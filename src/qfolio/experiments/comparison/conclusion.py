@@ -13,14 +13,14 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
     each = f"with {seeds} {plural('seed', seeds)} each"
     results = {name: entry["final"]["per_seed"] for name, entry in ranking["agents"].items()}
     level = [name for name in ranking["order"] if results[name] == results[first]]
-    beaten = {
-        row["second"]: row["told_apart"] and row["probability"] > 0.5
-        for row in ranking["pairs"]
-        if row["first"] == first and row["second"] not in level
-    }
-    valued = {name: f"{name} ({result_of(ranking, name)})" for name in beaten}
-    tied = [valued[name] for name, worse in beaten.items() if not worse]
-    worse = [valued[name] for name, worse in beaten.items() if worse]
+    tied: list[str] = []
+    worse: list[str] = []
+    better: list[str] = []
+    for row in ranking["pairs"]:
+        if row["first"] == first and (other := row["second"]) not in level:
+            group = worse if row["probability"] > 0.5 else better
+            group = group if row["told_apart"] else tied
+            group.append(f"{other} ({result_of(ranking, other)})")
     end, they, their = ("ends", "it", "its regret")
     if len(level) > 1:
         end, they, their = ("end", "they", "the regret of each")
@@ -42,7 +42,9 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
             f"{each.capitalize()} {none} be told apart, whatever their results; this needs "
             f"{ranking['seeds_needed']} seeds or more."
         )
-    said = [f"{best} {result_of(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
+    ahead = f"Most seeds of {listed(better)} end better, though." if better else ""
+    result = f"{best} {result_of(ranking, first, interval=True)}."
+    said = [result, sentence, ahead, _quickest(ranking)]
     return [each for each in said if each]
 
 
@@ -72,7 +74,7 @@ def share(fraction: float) -> str:
 
 def amount(value: float) -> str:
     """A number with four significant digits."""
-    if abs(value) >= 1000:
+    if abs(float(f"{value:.4g}")) >= 1000:
         return figure(value, ",.0f")
     return figure(value, "#.4g" if abs(value) >= 1 else ".4g")
 
@@ -94,11 +96,15 @@ def _quickest(ranking: dict[str, Any]) -> str:
     }
     if not arrived:
         return f"No agent settles {near}."
-    frugal = min(arrived, key=lambda name: arrived[name]["steps"])
-    quick = min(arrived, key=lambda name: arrived[name]["seconds"])
-    steps = f"{arrived[frugal]['steps']:,.0f}"
-    seconds = f"{span(arrived[quick]['seconds'])} a seed"
+    fewest, least = (min(entry[key] for entry in arrived.values()) for key in ("steps", "seconds"))
+    frugal = [name for name, entry in arrived.items() if entry["steps"] == fewest]
+    quick = [name for name, entry in arrived.items() if entry["seconds"] == least]
+    seconds = f"{span(least)} a seed"
     if len(arrived) == 1:
-        return f"Only {frugal} settles {near}, after {steps} steps and {seconds}."
-    least = f"{quick} the least time" if quick != frugal else "the least time"
-    return f"To settle {near}, {frugal} needs the fewest steps ({steps}) and {least} ({seconds})."
+        return f"Only {frugal[0]} settles {near}, after {fewest:,.0f} steps and {seconds}."
+    need = "need" if len(frugal) > 1 else "needs"
+    time = f"{listed(quick)} the least time" if quick != frugal else "the least time"
+    return (
+        f"To settle {near}, {listed(frugal)} {need} the fewest steps ({fewest:,.0f}) and {time} "
+        f"({seconds})."
+    )

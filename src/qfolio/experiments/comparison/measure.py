@@ -24,7 +24,7 @@ def measure(run: Run, devices: int) -> Result:
     seeds = len(run.population.seeds)
     rows = run.evaluations
     members = jax.eval_shape(partial(begin, run.task, run.agent), jnp.uint32(0))
-    weights = jax.tree.leaves(jax.eval_shape(run.agent.weights, members.agent))
+    weights = _read_by_policy(run)
     at_once = 1 if isinstance(run.population, HostPopulation) else min(devices, seeds)
     return Result(
         returns=summary["return_per_seed"],
@@ -46,6 +46,18 @@ def measure(run: Run, devices: int) -> Result:
         policy_bytes=_bytes(weights),
         parameters=sum(x.size for x in weights if jnp.issubdtype(x.dtype, jnp.floating)),
     )
+
+
+def _read_by_policy(run: Run) -> list[Any]:
+    """The arrays that decisions depend on: of the weights, a critic is left out."""
+    state = jax.eval_shape(partial(begin, run.task, run.agent), jnp.uint32(0))
+    weights = jax.eval_shape(run.agent.weights, state.agent)
+    seen = jax.eval_shape(jax.vmap(run.task.observe), state.task)
+    program = jax.make_jaxpr(run.agent.policy)(weights, seen).jaxpr
+    read = {id(x) for equation in program.eqns for x in equation.invars}
+    read |= {id(x) for x in program.outvars}
+    leaves = jax.tree.leaves(weights)
+    return [leaf for leaf, x in zip(leaves, program.invars, strict=False) if id(x) in read]
 
 
 def _bytes(leaves: list[Any]) -> int:

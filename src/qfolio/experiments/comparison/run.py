@@ -25,7 +25,7 @@ from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, read_json
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
-from qfolio.core.statistics import regret
+from qfolio.core.statistics import interquartile_mean, regret
 from qfolio.core.text import amount, listed
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range, unlearned
@@ -423,8 +423,8 @@ def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
 
 
 def _measures(result: Result) -> dict[str, float | None]:
-    """The measures of a result in the log."""
-    final, optimum = float(np.mean(result.returns)), result.optimum
+    """The measures of a result in the log: interquartile means over seeds, as in the ranking."""
+    final, optimum = float(interquartile_mean(result.returns)), result.optimum
     missed = None if optimum is None else float(regret(final, optimum))
     return {"return": final, "optimum": optimum, "regret": missed}
 

@@ -34,6 +34,7 @@ class Report(NamedTuple):
     seconds_left: float
     rows: Records
     members: Sequence[int]
+    ends: Sequence[int]
 
 
 class Done(NamedTuple):

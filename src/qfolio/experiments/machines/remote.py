@@ -20,6 +20,7 @@ class Reporter(Listener):
         self.send, self.sent = send, 0.0
         self.rows: list[Records] = []  # of each chunk
         self.members: list[int] = []
+        self.ends: list[int] = []
 
     def on_start(self, training: Training) -> None:
         self._report("on_start", training)
@@ -27,6 +28,7 @@ class Reporter(Listener):
     def on_chunk(self, training: Training, rows: Records) -> None:
         self.rows.append(rows)
         self.members += training.members
+        self.ends += training.ends
         if training.finished or perf_counter() - self.sent > EVERY:
             self._report("on_chunk", training)
             self.sent = perf_counter()
@@ -50,9 +52,10 @@ class Reporter(Listener):
                 training.seconds_left,
                 Records.joined(self.rows),
                 self.members,
+                self.ends,
             )
         )
-        self.rows, self.members = [], []
+        self.rows, self.members, self.ends = [], [], []
 
 
 class RemoteTraining(Training):
@@ -60,7 +63,8 @@ class RemoteTraining(Training):
 
     def __init__(self, report: Report) -> None:
         self.budget, self.config, self.begun = report.budget, report.config, report.begun
-        self.left, self.seconds, self.members = report.left, report.seconds, report.members
+        self.left, self.seconds = report.left, report.seconds
+        self.members, self.ends = report.members, report.ends
         self.interrupted, self.where = False, report.where
         self._report = report
 

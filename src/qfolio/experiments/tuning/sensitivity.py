@@ -63,19 +63,27 @@ class Outcome:
             return f"{share}% of the best return"
         return f"{share} points of regret"
 
+    @property
+    def unit(self) -> float:
+        """The return whose shares are lost: the optimum, or the best."""
+        return max(abs(self.best if self.optimum is None else self.optimum), 1e-12)
+
     def height(self, returns: ArrayLike) -> Floats:
-        """Heights of returns; NaN counts as the worst."""
-        values = np.nan_to_num(np.asarray(returns, float), nan=self.floor)
+        """Heights of returns; NaN counts as clearly worse than the worst."""
+        values = np.asarray(returns, float)
         if self.optimum is None:
-            return np.asarray(np.maximum(values, self.floor))
-        regret = (self.optimum - values) / max(abs(self.optimum), 1e-12)
+            values = np.maximum(values, self.floor)
+        values = np.where(np.isnan(values), self.floor - 2 * TOLERANCE * self.unit, values)
+        if self.optimum is None:
+            return values
+        regret = (self.optimum - values) / self.unit
         return np.asarray(-np.log10(np.maximum(regret, _LEAST_REGRET)))
 
     def loss(self, height: ArrayLike) -> Floats:
         """The loss at a height, as a share of the optimum (or of the best return)."""
         values = np.asarray(height, float)
         if self.optimum is None:
-            return np.asarray((self.best - values) / max(abs(self.best), 1e-12))
+            return np.asarray((self.best - values) / self.unit)
         return np.asarray(10.0**-values)
 
 
@@ -120,7 +128,7 @@ class Sensitivity:
 def sensitivity(
     space: Sequence[Dimension], trials: Sequence[Trial], optimum: float | None
 ) -> Sensitivity | None:
-    """Importance and effect of each setting; None if there are too few trials."""
+    """Importance and effect of each setting; None if trials are too few, or all alike."""
     values = [trial.value for trial in trials]
     if np.isfinite(values).sum() < ENOUGH:
         return None
@@ -212,7 +220,9 @@ class _Model:
 def verdicts(found: Sensitivity | None, trials: Sequence[Trial]) -> list[str]:
     """Which settings matter, in sentences."""
     if found is None:
-        return [f"{ENOUGH} trials with a finite loss are needed to say what matters."]
+        if sum(math.isfinite(trial.value) for trial in trials) < ENOUGH:
+            return [f"{ENOUGH} trials with a finite loss are needed to say what matters."]
+        return ["All trials ended alike: within the searched ranges no setting matters."]
     effects = found.effects
     if found.explained < 0.2:
         return [
@@ -229,12 +239,19 @@ def verdicts(found: Sensitivity | None, trials: Sequence[Trial]) -> list[str]:
             f"Of {len(drawn)} configurations drawn at random, {good or 'none'} lost no more than "
             f"{found.outcome.tolerance} to the best."
         )
-    strong = [e for e in effects if e.share >= 0.1 and e.width < 0.9]
+    loud = [e for e in effects if e.share >= 0.1]
+    strong = [e for e in loud if e.width < 0.9]
     idle = [e for e in effects if e.share < 0.05 and e.width >= 0.75]
     if strong:
         names = listed([f"{e.dimension.name} ({percent(e.share)})" for e in strong])
         sentences.append(
             f"What matters most: {names}, by the share of the variation that each explains alone."
+        )
+    elif loud:
+        names = listed([f"{e.dimension.name} ({percent(e.share)})" for e in loud])
+        sentences.append(
+            f"The variation comes from {names}, by the share that each explains alone, but hardly "
+            f"any value costs more than {found.outcome.tolerance}."
         )
     else:
         sentences.append("No setting by itself explains a tenth of the variation.")

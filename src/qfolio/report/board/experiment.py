@@ -94,22 +94,24 @@ class Curve:
 
     def __init__(self) -> None:
         self.points: list[Point] = []
-        self._every, self._skipped = 1, 0
+        self._every, self._since = 1, 0  # a point is kept of so many, and those since the last
 
     def add(self, step: float, values: Sequence[float | None]) -> None:
-        """Adds what the members have at a step; of a long curve, only every so many are kept."""
+        """Adds what the members have at a step; a long curve keeps some points, and the latest."""
         known = [x for x in values if x is not None and math.isfinite(x)]
-        self._skipped += 1
-        if not known or (self._skipped < self._every and self.points):
+        if not known:
             return
-        self._skipped = 0
+        if self._since:
+            self.points.pop()
         self.points.append((step, sum(known) / len(known), min(known), max(known)))
-        if len(self.points) > POINTS:
+        self._since = (self._since + 1) % self._every
+        if len(self.points) > POINTS and not self._since:
             self.points, self._every = self.points[::2], 2 * self._every
 
     def cut(self, step: float) -> None:
         """Drops the points beyond a step."""
         self.points = [point for point in self.points if point[0] <= step]
+        self._since = 0
 
 
 class Job:

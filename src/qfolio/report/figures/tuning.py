@@ -67,7 +67,8 @@ def draw_pair(data: Sweep, width: float) -> Figure:
     figure = new_figure(width, 0.78 * width if width > NARROW else 1.05 * width)
     axes = figure.subplots()
     heights = data.found.outcome.height([trial.value for trial in data.trials])
-    ranks = heights.argsort().argsort() / max(1, len(heights) - 1)
+    # Equal results have one shade: the share of trials that are worse, and half of the equal ones.
+    ranks = ((heights[:, None] > heights) + (heights[:, None] == heights) / 2).mean(1)
     shades = [_SHADES[min(SHADES - 1, int(rank * SHADES))] for rank in ranks]
     order = heights.argsort()
     x, y = _places(data, across), _places(data, up)
