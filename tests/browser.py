@@ -88,7 +88,7 @@ class Browser:
     def wait(self, condition: str) -> None:
         self.evaluate(
             "new Promise((done, fail) => { const started = Date.now(); const look = () => "
-            f"({condition}) ? done() : Date.now() - started > 20000 ? fail('never happened') : "
+            f"({condition}) ? done() : Date.now() - started > 50000 ? fail('never happened') : "
             "setTimeout(look, 20); look(); })"
         )
 

@@ -12,13 +12,16 @@ from shell import qfolio
 def test_the_command_says_where_the_board_is_and_ends_with_ctrl_c(tmp_path):
     command = [sys.executable, "-m", "qfolio", "board", str(tmp_path), "--port", "0", "--no-open"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ) as process:
-        assert process.stdout is not None
-        said = process.stdout.readline()
-        assert said.startswith(f"The board of {tmp_path} is at http://127.0.0.1:")
-        with urllib.request.urlopen(said.split()[-1], timeout=10) as answer:
-            assert b"<title>qfolio board</title>" in answer.read()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 130
+        try:
+            assert process.stdout is not None
+            said = process.stdout.readline()
+            assert said.startswith(f"The board of {tmp_path} is at http://127.0.0.1:")
+            with urllib.request.urlopen(said.split()[-1], timeout=60) as answer:
+                assert b"<title>qfolio board</title>" in answer.read()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 130
+        finally:
+            process.kill()
 
 
 def test_a_folder_that_is_none_is_refused_in_a_sentence(monkeypatch, capsys, tmp_path):

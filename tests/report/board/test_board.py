@@ -5,7 +5,9 @@ import json
 import os
 import threading
 import time
+from itertools import count
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -128,19 +130,17 @@ def test_a_log_that_was_cut_is_read_again(tmp_path):
 
 
 def test_a_long_log_is_read_in_several_answers(tmp_path, monkeypatch):
+    """On a clock on which each look at it takes a second."""
     monkeypatch.setattr(events, "CHUNK", 100)
+    monkeypatch.setattr(experiments, "time", Mock(perf_counter=count().__next__, time=time.time))
     write(tmp_path, start(), RUNNING, *(record(step, step) for step in range(50)))
     experiment = Experiment(tmp_path.name, tmp_path / EVENTS)
     known = []
-    for version in range(1, 500):
-        experiment.refresh(version, until=time.perf_counter() + 1e-4)
-        known.append(
-            len(experiment.jobs[""].curves["return"].points) if "" in experiment.jobs else 0
-        )
-        if known[-1] == 50:
-            break
+    for version in range(20):
+        experiment.refresh(version, until=5 * (version + 1))
+        known.append(len(experiment.jobs[""].curves["return"].points))
+    assert 0 < known[0] < known[1] < 50
     assert known[-1] == 50
-    assert known[0] < 50
 
 
 def test_a_page_gets_few_points_of_many_curves(monkeypatch, tmp_path):
@@ -205,11 +205,11 @@ def test_hundreds_of_runs_that_write(tmp_path, monkeypatch):
     version = shelf.runs(0)["version"]
     for folder in folders[:100]:
         write(folder, record(60, 60))
-    begun = time.perf_counter()
+    begun = time.process_time()
     news = shelf.runs(version)
     assert len(news["runs"]) == 100
     assert len(news["keys"]) == 300
-    assert time.perf_counter() - begun < 1
+    assert time.process_time() - begun < 1  # a hundredth of it, of this process alone
     assert shelf.runs(news["version"])["runs"] == []
 
 
@@ -273,7 +273,7 @@ def board(tmp_path):
 
 
 def ask(board, path, method="GET", host=None):
-    connection = http.client.HTTPConnection("127.0.0.1", board.server_port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", board.server_port, timeout=60)
     connection.putrequest(method, path, skip_host=True)
     if host != "":
         connection.putheader("Host", host or f"127.0.0.1:{board.server_port}")
