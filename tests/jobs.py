@@ -16,6 +16,18 @@ from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.machines.parcels import Packer, Unpacker
 from qfolio.experiments.records import Records
 
+LIMIT = 240.0
+"""Seconds after which what is waited for will not come, however busy the machine is."""
+
+
+def wait_until(condition, seconds=LIMIT):
+    """Waits for a condition; returns True."""
+    end = time.perf_counter() + seconds
+    while not condition():
+        assert time.perf_counter() < end, "it has not come"
+        time.sleep(0.02)
+    return True
+
 
 @dataclass(frozen=True)
 class Add:
@@ -37,8 +49,7 @@ class Meet(Add):
 
     def run(self, listeners):
         (self.folder / str(os.getpid())).touch()
-        while len(list(self.folder.iterdir())) < 2:
-            time.sleep(0.05)
+        wait_until(lambda: len(list(self.folder.iterdir())) > 1)
         return super().run(listeners)
 
 
@@ -82,18 +93,20 @@ class Die:
 
 @dataclass(frozen=True)
 class Sleep:
-    """Says that it has begun, in a file with its process, and takes a while, the first time."""
+    """Says that it has begun, in a file with its process, and waits for a file, the first time.
+
+    Longer than anybody waits for its end: where nobody wakes it, it does not end by itself.
+    """
 
     name: str
     folder: Path
-    seconds: float = 60.0
 
     def run(self, listeners):
         if (self.folder / self.name).exists():
             return "begun before"
         (self.folder / f"{self.name}.part").write_text(str(os.getpid()))
         (self.folder / f"{self.name}.part").rename(self.folder / self.name)
-        time.sleep(self.seconds)
+        wait_until(lambda: (self.folder / "wake").exists(), 2 * LIMIT)
         return "rested"
 
 
@@ -137,15 +150,6 @@ class Pretended:
 def silent(job):
     """No listeners."""
     return ()
-
-
-def wait_until(condition, seconds=240):
-    """Waits for a condition, long enough for a busy machine; returns True."""
-    end = time.perf_counter() + seconds
-    while not condition():
-        assert time.perf_counter() < end
-        time.sleep(0.02)
-    return True
 
 
 def alive(process: int) -> bool:

@@ -12,16 +12,12 @@ import pytest
 
 from qfolio.experiments.events import EVENTS, read
 
-from jobs import alive, wait_until
+from jobs import LIMIT, alive, wait_until
 from shell import qfolio
 from tables import write_table
 
 TRAIN = ["train", "pendulum", "--no-compare", "--seeds", "2", "--episodes", "100000",
          "--set", "hidden=8", "num_envs=2", "batch_size=8", "learning_starts=16"]  # fmt: skip
-
-
-LIMIT = 300.0
-"""Seconds after which what is waited for will not come, however busy the machine is."""
 
 
 @pytest.fixture

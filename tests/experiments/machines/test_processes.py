@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,12 @@ from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.processes import Processes
 
 import jobs
-from jobs import Add, Die, Fail, Print, Sleep, Tell, alive, silent, wait_until
+from jobs import LIMIT, Add, Die, Fail, Print, Sleep, Tell, alive, silent, wait_until
+
+
+def begun(*files):
+    """Waits until jobs have begun."""
+    wait_until(lambda: all(file.exists() for file in files))
 
 
 @pytest.mark.parametrize(
@@ -76,10 +80,9 @@ def test_ctrl_c_ends_workers_that_are_kept_between_maps(tmp_path):
     """In a later map as in the first."""
 
     def press():
-        wait_until((tmp_path / "a").exists)
+        begun(tmp_path / "a")
         os.kill(os.getpid(), signal.SIGINT)
 
-    begun = time.perf_counter()
     with persistent(Processes(1)) as executor:
         for work in ([Add("first", 1.0)], [Sleep("a", tmp_path)]):
             with interruptible() as stop:
@@ -88,7 +91,6 @@ def test_ctrl_c_ends_workers_that_are_kept_between_maps(tmp_path):
                 done = [job.name for job, _ in executor.map(work, silent)]
     assert stop.is_set()
     assert done == []
-    assert time.perf_counter() - begun < 45
 
 
 def test_listeners_hear_of_trainings_on_workers():
@@ -162,20 +164,18 @@ def test_ctrl_c_ends_all_workers_and_keeps_what_is_done(tmp_path):
     work: list[Job] = [Add("done", 1.0), *(Sleep(name, tmp_path) for name in names)]
 
     def press():
-        wait_until(lambda: all(file.exists() for file in files))
+        begun(*files)
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=press).start()
-    begun = time.perf_counter()
     assert [job.name for job, _ in Processes(2).map(work, silent)] == ["done"]
-    assert time.perf_counter() - begun < 45
     assert not any(alive(int(file.read_text())) for file in files)
 
 
 def test_a_reader_that_leaves_ends_all_workers(tmp_path):
     run = Processes(2).map([Add("done", 1.0), Sleep("a", tmp_path)], silent)
     next(run)
-    wait_until((tmp_path / "a").exists)
+    begun(tmp_path / "a")
     run.close()
     assert not alive(int((tmp_path / "a").read_text()))
 
@@ -190,7 +190,7 @@ def test_a_script_that_its_workers_run_again(tmp_path):
         "list(Processes(1).map([Add('a', 1.0)], lambda job: ()))\n"
     )
     command = [sys.executable, str(script), str(Path(jobs.__file__).parent)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
     (*_, last) = done.stderr.splitlines()
     assert last.endswith(
         "QfolioError: No worker stays alive; the last one: its process ended with code 1 as it "
@@ -208,7 +208,7 @@ def test_a_script_that_its_workers_cannot_read(tmp_path):
     )
     command = [sys.executable, "-", str(Path(jobs.__file__).parent)]
     done = subprocess.run(
-        command, input=script, capture_output=True, text=True, timeout=60, check=False
+        command, input=script, capture_output=True, text=True, timeout=LIMIT, check=False
     )
     (*_, last) = done.stderr.splitlines()
     assert last.endswith("as it started; save the script in a file, which new processes can read.")
@@ -224,8 +224,8 @@ def test_workers_end_with_a_driver_that_is_killed(tmp_path):
         "    list(Processes(1).map([Sleep('a', Path(sys.argv[1]))], lambda job: ()))\n"
     )
     driver = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), *sys.path])
-    wait_until((tmp_path / "a").exists)
+    begun(tmp_path / "a")
     driver.kill()
     driver.wait()
     process = int((tmp_path / "a").read_text())
-    wait_until(lambda: not alive(process), seconds=10)
+    wait_until(lambda: not alive(process))

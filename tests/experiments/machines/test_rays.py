@@ -26,7 +26,7 @@ from qfolio.experiments.machines.schedule import ATTEMPTS
 from qfolio.experiments.run import Run
 
 import jobs
-from jobs import Add, Die, Fail, Meet, Sleep, alive, silent, wait_until
+from jobs import LIMIT, Add, Die, Fail, Meet, Sleep, alive, silent, wait_until
 
 pytestmark = [
     pytest.mark.filterwarnings("default"),  # Ray's own
@@ -124,7 +124,7 @@ class TestRay:
         stored = {(result["place"], result["table"]) for result in results.values()}
         places = {place for place, _ in stored}
         assert len(stored) == len(places) > 1
-        assert wait_until(lambda: not any(map(alive, places)))
+        wait_until(lambda: not any(map(alive, places)))
 
     @pytest.mark.skipif(
         importlib.util.find_spec("grpc") is None, reason='needs pip install "ray[client]"'
@@ -142,14 +142,14 @@ class TestRay:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
         done = subprocess.run(
             [sys.executable, "-c", code],
-            capture_output=True, text=True, timeout=300, env=environment, check=False,
+            capture_output=True, text=True, timeout=LIMIT, env=environment, check=False,
         )  # fmt: skip
         assert done.stdout == "3 45.0\n", done.stderr
 
     def test_a_cluster_that_is_not_there(self):
         done = subprocess.run(
             [sys.executable, "-m", "qfolio", "backtest", "--on", "ray://127.0.0.1:1"],
-            capture_output=True, text=True, timeout=120, check=False,
+            capture_output=True, text=True, timeout=LIMIT, check=False,
             env=os.environ | {"RAY_CLIENT_INITIAL_CONNECTION_TIMEOUT_S": "1"},
         )  # fmt: skip
         assert done.returncode == 2
@@ -198,15 +198,21 @@ class TestRay:
             "import sys\n"
             "from qfolio.experiments.machines.choice import on\n"
             "from qfolio.experiments.run import Run\n"
-            "Run.open(sys.argv[1]).train(executor=on('ray'))\n"
+            "begun = []\n"
+            "def listen(job, done, share):\n"
+            "    begun.append(job)\n"
+            "    if len(begun) == 4: sys.stdin.read()\n"  # so that it does not finish them all
+            "    return []\n"
+            "Run.open(sys.argv[1]).train(executor=on('ray'), listen=listen)\n"
         )
         environment = os.environ | {"RAY_ADDRESS": nodes.cluster.address}
-        driver = subprocess.Popen([sys.executable, "-c", code, str(folder)], env=environment)
+        command = [sys.executable, "-c", code, str(folder)]
+        driver = subprocess.Popen(command, stdin=subprocess.PIPE, env=environment)
         try:
             wait_until(lambda: any((folder / "seeds").glob("[0-9]")))
         finally:
             driver.kill()
-            driver.wait()
+            driver.communicate()
         kept = {path.name for path in (folder / "seeds").glob("[0-9]")}
         resumed, asked = Run.open(folder), set[str]()
 
@@ -232,6 +238,7 @@ class TestRay:
             list(on("ray").map([Fail("a", SystemExit("no license"))], silent))
 
     def test_ctrl_c(self, nodes, tmp_path):
+        """With two workers, so that the last job begins when the first is done."""
         names = ("a", "b")
 
         def press():
@@ -240,9 +247,9 @@ class TestRay:
 
         threading.Thread(target=press).start()
         work: list[Job] = [Add("done", 1.0), *(Sleep(name, tmp_path) for name in names)]
-        assert [job.name for job, _ in on("ray").map(work, silent)] == ["done"]
+        assert [job.name for job, _ in Ray(workers=2).map(work, silent)] == ["done"]
         places = [int((tmp_path / name).read_text()) for name in names]
-        assert wait_until(lambda: not any(map(alive, places)))
+        wait_until(lambda: not any(map(alive, places)))
 
     def test_other_versions_are_refused(self, nodes, monkeypatch):
         monkeypatch.setattr(dispatch, "versions", lambda: {"qfolio": "99"})
@@ -250,6 +257,7 @@ class TestRay:
             list(on("ray").map([Add("a", 1.0)], silent))
 
     def test_a_node_without_qfolio(self, nodes, tmp_path):
+        """The other nodes cannot do all that there is to do."""
         (tmp_path / "qfolio").mkdir()
         (tmp_path / "qfolio" / "__init__.py").write_text(
             "raise ModuleNotFoundError(\"No module named 'qfolio'\")"
@@ -259,7 +267,7 @@ class TestRay:
         )
         try:
             with pytest.raises(QfolioError, match=r"has no qfolio; install qfolio .* on all"):
-                list(on("ray").map([Add(str(i), i) for i in range(4)], silent))
+                list(on("ray").map([Sleep(str(i), tmp_path) for i in range(4)], silent))
         finally:
             nodes.cluster.remove_node(bare)
 
@@ -269,9 +277,12 @@ class TestRay:
 
         def remove():
             wait_until(lambda: all((tmp_path / name).exists() for name in names))
+            places = [int((tmp_path / name).read_text()) for name in names]
             nodes.cluster.remove_node(nodes.nodes[0], allow_graceful=False)
+            wait_until(lambda: not all(map(alive, places)))
+            (tmp_path / "wake").touch()
 
         threading.Thread(target=remove).start()
-        work = [Sleep(name, tmp_path, seconds=10.0) for name in names]
+        work = [Sleep(name, tmp_path) for name in names]
         results = {job.name: result for job, result in on("ray").map(work, silent)}
         assert sorted(results.values()) == ["begun before", "rested", "rested"]
