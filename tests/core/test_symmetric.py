@@ -11,6 +11,8 @@ import pytest
 
 from qfolio.core.symmetric import solve, spectrum
 
+from jobs import LIMIT
+
 PROGRAM = """
 from qfolio.core import devices
 devices.configure()
@@ -27,7 +29,7 @@ for _ in range(100):
 
 def test_batches_end_on_all_devices_at_once():
     environment = {k: v for k, v in os.environ.items() if k not in ("NPROC", "XLA_FLAGS")}
-    subprocess.run([sys.executable, "-c", PROGRAM], env=environment, timeout=120, check=True)
+    subprocess.run([sys.executable, "-c", PROGRAM], env=environment, timeout=LIMIT, check=True)
 
 
 @pytest.fixture
