@@ -165,7 +165,10 @@ def test_a_metric_may_be_named_like_what_each_object_has(
     browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length > 0")
     browser.click("#runs li:not(.chosen) .pick")
     browser.wait("document.getElementById('charts').innerText.includes('Constructor')")
-    assert "stopped" not in browser.evaluate("document.getElementById('counts').innerText")
+    # The runs have, after ten seconds without a sign of life.
+    assert "server has stopped" not in browser.evaluate(
+        "document.getElementById('counts').innerText"
+    )
 
 
 def test_agents_of_a_backtest_have_charts_of_their_own(
