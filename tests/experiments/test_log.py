@@ -19,7 +19,7 @@ from qfolio.experiments.machines.remote import RemoteTraining, hear
 from qfolio.experiments.records import Records
 from qfolio.experiments.run import Run
 
-from jobs import wait
+from jobs import wait_until
 from listeners import Interrupt
 from probes import Endless, Explosive
 
@@ -164,7 +164,7 @@ def test_the_file_is_touched_while_a_process_works(tmp_path, monkeypatch):
     monkeypatch.setattr(logs, "BEAT", 0.01)
     with Log(tmp_path).opened(kind="run"):
         os.utime(tmp_path / EVENTS, (1, 1))
-        wait(lambda: (tmp_path / EVENTS).stat().st_mtime > 1000)
+        wait_until(lambda: (tmp_path / EVENTS).stat().st_mtime > 1000)
 
 
 @pytest.mark.parametrize("environments", [1, 300])
