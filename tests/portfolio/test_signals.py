@@ -313,6 +313,30 @@ def test_two_assets_tie_where_rounding_alone_tells_them_apart(text, scale):
     assert (abs(three).max(1) > 0.5).all()
 
 
+@pytest.mark.parametrize("text", ["drift:20-2", "volatility:20", "volatility-ratio:20-5"])
+def test_a_deposit_among_stocks_leaves_their_signals_as_they_are(text):
+    """Its returns are all the same, up to rounding, so that it has no volatility."""
+    stocks = random_walk(60, 4, volatility=0.02)
+    deposit = 100 * 1.0001 ** np.arange(60)[:, None]
+    found = signals.compute(signals.parse(text), np.hstack([stocks, deposit]), "raw")
+    np.testing.assert_array_equal(found[:, -1], 0)
+    if not text.startswith("drift"):  # which is centered
+        alone = signals.compute(signals.parse(text), stocks, "raw")
+        np.testing.assert_array_equal(found[:, :4], alone)
+    assert abs(found).max() < 20
+
+
+def test_what_all_share_is_known_of_assets_that_are_not_there():
+    """Or it would be 0 for these, far from all that it ever is, in the mean over the assets."""
+    values, there = random_walk(60, 4, volatility=0.02), np.ones((60, 4), bool)
+    there[:, 2:] = False
+    chosen = signals.parse("market-volatility:20,volatility:20")
+    found = signals.compute(chosen, values, "raw", tradable=there)
+    np.testing.assert_array_equal(found[..., 0], found[:, :1, 0].repeat(4, 1))
+    assert found[-1, 2:, 0].max() < -3
+    np.testing.assert_array_equal(found[:, 2:, 1], 0)
+
+
 def test_an_asset_that_is_the_market_has_no_residual():
     assert np.isnan(signal("residual-volatility:20", prices(assets=1))).all()
 

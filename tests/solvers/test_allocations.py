@@ -120,6 +120,23 @@ def test_the_highest_ratio_of_uncorrelated_assets() -> None:
     np.testing.assert_array_equal(maximum_ratio([1.0, 2.0], np.eye(2), 0.5), [0.5, 0.5])
 
 
+@pytest.mark.parametrize("cap", [0.5, 0.4])
+def test_assets_that_are_alike_have_a_highest_ratio(cap: float) -> None:
+    """Weight can be shifted between them without any change, so that a step is not unique."""
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        found = rng.normal(5e-4, 0.01, (500, 5))
+        found[:, 1] = found[:, 0]
+        mean, sigma = found.mean(axis=0), np.cov(found.T)
+        if mean.max() <= 0:
+            continue
+        w = maximum_ratio(mean, sigma, cap)
+        assert w.sum() == pytest.approx(1, abs=1e-12)
+        assert w.max() <= cap + 1e-12
+        slope = mean / (mean @ w) - sigma @ w / (w @ sigma @ w)
+        assert slope[w > 1e-6].min() >= slope[w < cap - 1e-6].max() - 1e-3
+
+
 def test_ratios_without_a_highest() -> None:
     with pytest.raises(QfolioError, match="no portfolio within the cap has a positive mean"):
         maximum_ratio([-1.0, 0.0], np.eye(2))

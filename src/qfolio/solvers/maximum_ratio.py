@@ -89,7 +89,10 @@ def _interior_point(mu: Floats, sigma: Floats, cap: float, tol: float) -> Floats
             ratio = v / s
             system += cap * (cap * ratio.sum() - ratio[:, None] - ratio)
             system[diagonal] += ratio
-        step = solve(system, target / y + room(pushed) - slope)
+        right = target / y + room(pushed) - slope
+        step = solve(system, right)
+        if not np.isfinite(step).all() and np.isfinite(system).all():
+            step = np.linalg.lstsq(system, right, rcond=None)[0]  # assets that are alike: of many
         step_s = room(step)
         if not np.isfinite(step).all():
             break

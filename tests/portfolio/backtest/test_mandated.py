@@ -254,3 +254,11 @@ def test_without_a_mandate_the_program_is_as_before():
     assert mandated(backtest.replay) == []
     capped = create(None, agents={"pathwise": AGENTS["pathwise"]}, cap=0.15).replay
     assert mandated(capped) == ["The cap of 15% for each of 5 assets forces at least 25% cash."]
+
+
+@pytest.mark.parametrize(("turnover", "said"), [(0.08, 1), (0.2, 0)])
+def test_a_band_in_which_all_orders_end_is_named(turnover, said):
+    given = {"trading": {"turnover": turnover, "calendar": "drift:0.05"}}
+    found = mandated(create(given, agents={"pathwise": AGENTS["pathwise"]}).replay)
+    assert len(found) == said
+    assert all("turnover of at most 8% that exchange assets" in note for note in found)

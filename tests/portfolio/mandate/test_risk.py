@@ -111,6 +111,21 @@ def test_no_order_is_nearer(risk):
         assert max(of_one_kind) < 1.005
 
 
+@pytest.mark.parametrize("forbidden", [[], ["A"]])
+def test_few_holdings_are_chosen_with_an_eye_on_risk(forbidden):
+    """All of B is wanted, but only B and C together are near enough to the benchmark."""
+    limits = {
+        "assets": {"forbidden": forbidden}, "trading": {"holdings": 2},
+        "risk": {"tracking_error": 0.05},
+    }  # fmt: skip
+    made = feasible(mandate_text(limits, ("A", "B", "C")), np.ones(3, bool))
+    covariance, benchmark = 0.04 * np.eye(3), np.array([0.0, 0.5, 0.5])
+    made = made.knowing(Risk(jnp.asarray(covariance), jnp.asarray(benchmark)))
+    order = exactly(made, np.array([0, 0, 1.0, 0]), np.array([1.0, 0, 0, 0]))
+    np.testing.assert_allclose(order, [0, 0, 0.5 + 0.25 / np.sqrt(2), 0.5 - 0.25 / np.sqrt(2)],
+                               atol=2e-3)  # fmt: skip
+
+
 @pytest.mark.parametrize("room", [2**24, 0])
 def test_the_risk_of_an_asset_that_joins_comes_from_its_own_days(monkeypatch, room):
     monkeypatch.setattr("qfolio.portfolio.mandate.risk.ROOM", room)

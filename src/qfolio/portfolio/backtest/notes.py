@@ -72,6 +72,13 @@ def mandated(replay: Replay) -> list[str]:
     notes = checks.unusual(replay.task.mandate, every, replay.cap)
     if not replay.task.mandate:
         return notes
+    band, turnover = replay.task.terms.band, replay.task.written.trading.turnover
+    if band and turnover is not None and turnover <= 2 * band:
+        notes.append(
+            f"Orders with a turnover of at most {100 * turnover:.3g}% that exchange assets change "
+            f"no weight by more than the calendar's band of {100 * band:.3g}%, within which "
+            "nothing is ordered; raise trading.turnover, or narrow the band."
+        )
     if replay.patterns is not None and (yields := replay.patterns[1]):
         said = ", ".join(yields)
         notes.append(f"The mandate is relaxed to fit the assets that can be traded: {said}.")

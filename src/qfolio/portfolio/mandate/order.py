@@ -287,7 +287,7 @@ def _gradients(
 
 
 def _fewer(rules: Rules, wanted: Weights, held: Weights) -> Limits:
-    """Limits that keep all but the largest weights at 0.
+    """Limits that keep all but the largest weights of the order without them at 0.
 
     If these need more turnover than there may be, the largest with what is held.
     """
@@ -298,21 +298,30 @@ def _fewer(rules: Rules, wanted: Weights, held: Weights) -> Limits:
         limits = _fixed(rules.limits, others, jnp.zeros_like(wanted))
         return excess(nearest(wanted, held, limits), held, limits).max(), limits
 
-    sizes = jnp.stack([nearest(wanted, held, rules.limits), held])
+    aim = nearest(wanted, held, rules.limits)
+    if rules.risk is not None:  # or the largest of a risky order would be kept, not of a safe one
+        too_risky = rules.share_of_risk(aim) > 1 + BARELY
+        given = wanted, held, aim, rules.limits, rules.limits
+        aim = jnp.where(too_risky, where_needed(_safer, too_risky, given, rules)[0], aim)
+    sizes = jnp.stack([aim, held])
     (over, over_as_held), limits = jax.vmap(only)(sizes)
     as_held = (over > BARELY) & (over > over_as_held)
     return jax.tree.map(lambda x: jnp.where(as_held, x[1], x[0]), limits)
 
 
 def _needed(limits: Limits, weights: Weights) -> Weights:
-    """Which assets are kept first: those with a floor, then the largest weights of each group
-    with a floor, as many as its caps require."""
+    """Which assets are kept first, and which last.
+
+    First are those with a floor, then the largest weights of each group with a floor, as many as
+    its caps require; last are those that must be 0.
+    """
     low, high, rows, most, *_ = limits
     members = (rows < 0) & ~(rows < 0).all(1)[:, None]  # of a floor, but not that of all assets
     larger = weights[None] > weights[:, None]
     room = jnp.where(members, high, 0.0) @ larger.T  # of larger weights, (row, asset)
     of_groups = (members & (room < -most[:, None] - BARELY)).any(0)
-    return 20.0 * ((low > 0) | (high < 0)) + 10.0 * of_groups
+    never = (low == 0) & (high == 0)
+    return 20.0 * ((low > 0) | (high < 0)) + 10.0 * of_groups - 1.0 * never
 
 
 def _without_small(

@@ -30,7 +30,7 @@ def compute(
     """Signals of shape (row, asset, signal), 0 where one is unknown or repeats an earlier one.
 
     prices, columns: of shape (row, asset), NaN where unknown. tradable: which assets are compared
-    at each row, likewise (default: all); the others' signals are 0.
+    at each row, likewise (default: all); the others' signals are 0, except those that all share.
 
     Raises QfolioError if the scale or a column is unknown, or if a signal has the wrong shape or
     looks ahead.
@@ -44,7 +44,10 @@ def compute(
     ]  # fmt: skip
     shared = [_is_shared(signal, x) for signal, x in zip(signals, values, strict=True)]
     if tradable is not None:
-        values = [np.where(tradable, x, np.nan) for x in values]
+        values = [
+            x if same else np.where(tradable, x, np.nan)
+            for x, same in zip(values, shared, strict=True)
+        ]
     found = [
         _scaled(x, same, s.scale or scale)
         for s, x, same in zip(signals, values, shared, strict=True)

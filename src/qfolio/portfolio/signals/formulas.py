@@ -178,7 +178,10 @@ def _covariance(x: Floats, y: Floats, rows: int) -> Floats:
 
 
 def _deviation(values: Floats, rows: int) -> Floats:
-    return _rolling(values, rows).std(ddof=0).to_numpy()
+    """The standard deviation; 0 where it is only the rounding of equal values."""
+    window = _rolling(values, rows)
+    found, mean = window.std(ddof=0).to_numpy(), window.mean().to_numpy()
+    return np.where(found > ROUNDING * abs(mean), found, 0 * found)
 
 
 def _slope(returns: Floats, market: Floats, rows: int) -> Floats:
