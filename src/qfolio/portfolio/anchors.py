@@ -37,9 +37,9 @@ def path(anchor: str, prices: Prices, buyable: Bools | None = None) -> Floats:
 
     The weights at a row depend on no later price. A baseline decides every month, or at every row
     if that is its calendar; between decisions its holding drifts, unless its target is to be held
-    at every row (the calendar "fold"). It may hold the assets that have had prices for a year; until
-    there are any, all that have a price. Where assets also leave the table, one that does not
-    estimate holds an asset from its first price on.
+    at every row (the calendar "fold"). It may hold the assets that have had prices for a year;
+    until there are any, all that have a price. Where assets also leave the table, one that does
+    not estimate holds an asset from its first price on.
 
     Raises QfolioError if there is no such baseline or column, if a baseline gives invalid weights,
     or if a column's weights are not at least 0, with a sum of at most 1.

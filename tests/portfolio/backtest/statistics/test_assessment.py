@@ -28,7 +28,8 @@ def test_assess_by_hand_on_one_block() -> None:
     )  # fmt: skip
     strong = strong._replace(returns=np.asarray(strong.returns) + 0.01)
     everything = {"equal weight": weak, "strong": strong, "dqn": agent}
-    result = assess(everything, days(300), periods_per_year=252, earlier_trials=2)
+    dates = days(300, "2001-01-01")
+    result = assess(everything, dates, periods_per_year=252, earlier_trials=2)
     table = measures(*record(agent), 252)
     dqn = result.strategies["dqn"]
     assert result.best_baseline == "strong"
