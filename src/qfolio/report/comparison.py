@@ -17,7 +17,14 @@ from qfolio.core.arrays import AnyFloats
 from qfolio.core.files import write_text
 from qfolio.core.statistics import FEWEST_SEEDS, band, interquartile_mean
 from qfolio.core.text import plural
-from qfolio.experiments.comparison.conclusion import amount, share, span
+from qfolio.experiments.comparison.conclusion import (
+    amount,
+    arrived,
+    best_of,
+    least,
+    share,
+    span,
+)
 from qfolio.experiments.comparison.ranking import HEADLINE, THRESHOLDS, Result, curve
 from qfolio.report import palette, rendering
 from qfolio.report.figures.style import (
@@ -288,8 +295,6 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
     first = ranking["order"][0]
     optimum = next(iter(results.values())).optimum
     near = f"{percent(HEADLINE, 0)}"
-    arrived = {name: _headline(data, name) for name in results}
-    arrived = {name: entry for name, entry in arrived.items() if entry["steps"] is not None}
     facts = [
         ("Agents", str(len(results)), f"{ranking['seeds']} {plural('seed', ranking['seeds'])} each")
     ]
@@ -298,16 +303,17 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
             ("Exact optimum", tidy(amount(optimum)), f"on {number(data.starts, 0)} fixed starts")
         )
     final = data.write(ranking["agents"][first]["final"]["iqm"])
-    results_of = {name: entry["final"]["per_seed"] for name, entry in ranking["agents"].items()}
-    level = [name for name in ranking["order"] if results_of[name] == results_of[first]]
+
+    def who(names: list[str]) -> str:
+        return names[0] if len(names) == 1 else f"{len(names)} agents"
+
     best = "Lowest regret" if data.graded else "Highest return"
-    facts.append((best, final, first if len(level) == 1 else f"{len(level)} agents"))
-    if arrived:
-        frugal = min(arrived, key=lambda name: arrived[name]["steps"])
-        quick = min(arrived, key=lambda name: arrived[name]["seconds"])
+    facts.append((best, final, who(best_of(ranking))))
+    if arrivals := arrived(ranking):
+        (steps, frugal), (seconds, quick) = (least(arrivals, key) for key in ("steps", "seconds"))
         facts += [
-            (f"Fewest steps to {near}", rendering.amount(arrived[frugal]["steps"]), frugal),
-            (f"Least time to {near}", tidy(span(arrived[quick]["seconds"])), f"{quick}, a seed"),
+            (f"Fewest steps to {near}", rendering.amount(steps), who(frugal)),
+            (f"Least time to {near}", tidy(span(seconds)), f"{who(quick)}, a seed"),
         ]
     total = sum(result.seconds_train for result in results.values())
     facts.append(("Training, in all", duration(total), "all agents and seeds"))

@@ -11,8 +11,7 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
     """The conclusions that a ranking supports, in sentences."""
     first, seeds = ranking["order"][0], ranking["seeds"]
     each = f"with {seeds} {plural('seed', seeds)} each"
-    results = {name: entry["final"]["per_seed"] for name, entry in ranking["agents"].items()}
-    level = [name for name in ranking["order"] if results[name] == results[first]]
+    level = best_of(ranking)
     tied: list[str] = []
     worse: list[str] = []
     better: list[str] = []
@@ -46,6 +45,28 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
     result = f"{best} {result_of(ranking, first, interval=True)}."
     said = [result, sentence, ahead, _quickest(ranking)]
     return [each for each in said if each]
+
+
+def best_of(ranking: dict[str, Any]) -> list[str]:
+    """The first agent of the ranking, and those with the same results."""
+    results = {name: entry["final"]["per_seed"] for name, entry in ranking["agents"].items()}
+    return [name for name in ranking["order"] if results[name] == results[ranking["order"][0]]]
+
+
+def arrived(ranking: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What agents needed to settle near the goal, by name; those that never did are left out."""
+    return {
+        name: entry
+        for name in ranking["order"]
+        for entry in ranking["agents"][name]["within"]
+        if entry["threshold"] == HEADLINE and entry["steps"] is not None
+    }
+
+
+def least(arrivals: dict[str, dict[str, Any]], key: str) -> tuple[float, list[str]]:
+    """The least "steps" or "seconds" of some agents, and who needed no more."""
+    amount = min(entry[key] for entry in arrivals.values())
+    return amount, [name for name, entry in arrivals.items() if entry[key] == amount]
 
 
 def result_of(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
@@ -88,19 +109,12 @@ def _quickest(ranking: dict[str, Any]) -> str:
     """A sentence on which agents come near the goal in the fewest steps and the least time."""
     goal = "the optimum" if ranking["measure"] == "regret" else "the best return"
     near = f"within {HEADLINE:.0%} of {goal}"
-    arrived = {
-        name: entry
-        for name in ranking["order"]
-        for entry in ranking["agents"][name]["within"]
-        if entry["threshold"] == HEADLINE and entry["steps"] is not None
-    }
-    if not arrived:
+    arrivals = arrived(ranking)
+    if not arrivals:
         return f"No agent settles {near}."
-    fewest, least = (min(entry[key] for entry in arrived.values()) for key in ("steps", "seconds"))
-    frugal = [name for name, entry in arrived.items() if entry["steps"] == fewest]
-    quick = [name for name, entry in arrived.items() if entry["seconds"] == least]
-    seconds = f"{span(least)} a seed"
-    if len(arrived) == 1:
+    (fewest, frugal), (shortest, quick) = (least(arrivals, key) for key in ("steps", "seconds"))
+    seconds = f"{span(shortest)} a seed"
+    if len(arrivals) == 1:
         return f"Only {frugal[0]} settles {near}, after {fewest:,.0f} steps and {seconds}."
     need = "need" if len(frugal) > 1 else "needs"
     time = f"{listed(quick)} the least time" if quick != frugal else "the least time"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from qfolio.core.host import HostPopulation
-from qfolio.core.training import begin
+from qfolio.core.training import TrainingState, begin
 from qfolio.experiments.comparison.operations import operations_per_step
 from qfolio.experiments.comparison.ranking import Result
 from qfolio.experiments.grading import curve_optimum
@@ -24,7 +24,7 @@ def measure(run: Run, devices: int) -> Result:
     seeds = len(run.population.seeds)
     rows = run.evaluations
     members = jax.eval_shape(partial(begin, run.task, run.agent), jnp.uint32(0))
-    weights = _read_by_policy(run)
+    weights = _read_by_policy(run, members)
     at_once = 1 if isinstance(run.population, HostPopulation) else min(devices, seeds)
     return Result(
         returns=summary["return_per_seed"],
@@ -48,11 +48,10 @@ def measure(run: Run, devices: int) -> Result:
     )
 
 
-def _read_by_policy(run: Run) -> list[Any]:
+def _read_by_policy(run: Run, members: TrainingState) -> list[Any]:
     """The arrays that decisions depend on: of the weights, a critic is left out."""
-    state = jax.eval_shape(partial(begin, run.task, run.agent), jnp.uint32(0))
-    weights = jax.eval_shape(run.agent.weights, state.agent)
-    seen = jax.eval_shape(jax.vmap(run.task.observe), state.task)
+    weights = jax.eval_shape(run.agent.weights, members.agent)
+    seen = jax.eval_shape(jax.vmap(run.task.observe), members.task)
     program = jax.make_jaxpr(run.agent.policy)(weights, seen).jaxpr
     read = {id(x) for equation in program.eqns for x in equation.invars}
     read |= {id(x) for x in program.outvars}
