@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 from qfolio.core.files import write_arrays
@@ -483,7 +484,7 @@ def test_a_holding_within_the_band_is_said_to_stay(copy, monkeypatch, capsys, tm
     path.write_text(json.dumps(json.loads(path.read_text()) | {"calendar": "drift:0.01"}))
     options = [*AS_OF, "--agent", "equal-weight", "--capital", 1, "--whole-shares", "--dry-run"]
     assert qfolio(monkeypatch, "allocate", copy, *options) == 0
-    said = "Nothing is ordered: every trade is less than a whole share or lot."
+    said = "every trade is less than a whole share or lot, or costs more than it moves."
     assert said in " ".join(capsys.readouterr().out.split())
 
 
@@ -501,8 +502,16 @@ def test_a_budget_of_the_year_is_that_of_the_ledger(tmp_path, monkeypatch, capsy
     first = json.loads(printed.out)
     assert "fills orders over 3 rows" in printed.err
     assert "orders have used 0.0% this year, and this one uses 90.0%" in printed.err
+    assert "The expected cost is that of a single trade" in printed.err
     assert first["spent"] == 0
     assert sum(row["weight"] for row in first["assets"]) == pytest.approx(0.9)  # the whole order
+    # A row later one of three parts is filled, and then another one.
+    later = [each for each in follow if each not in AS_OF] + ["--dry-run", "--capital", 1000]
+    for rows, spent in ((261, 0.3), (262, 0.6), (263, 0.9)):
+        table = write_table(tmp_path / f"{rows}.csv", rows=rows)
+        day = str(np.datetime64("2020-01-01") + rows - 1)
+        assert qfolio(monkeypatch, *later, "--prices", table, "--as-of", day) == 0
+        assert json.loads(capsys.readouterr().out)["spent"] == pytest.approx(spent)
     newer = write_table(tmp_path / "newer.csv", rows=270)
     options = ["--prices", newer, "--as-of", "2020-09-26", "--capital", 1000]
     assert qfolio(monkeypatch, *(each for each in follow if each not in AS_OF), *options) == 0

@@ -238,7 +238,7 @@ def test_orders_filled_over_several_rows_equal_the_replay_of_their_parts():
     prices, model = table(), Proportional(0.002)
     target, fill = np.array([0.1, 0.3, 0.4, 0.2]), 4
     plan = Allocation.of(Fixed(target, model), prices.between(None, 11), np.zeros(3), 1e4)
-    live = mark([record(plan, 1)], prices, model, 1, fill)
+    live = mark([record(plan, 1)], prices, model, 1, [fill])
     shares, cash, wealth = np.zeros(3), 1e4, []
     for row in range(11, len(prices)):  # the first part is traded a row after the decision
         wealth.append(cash + shares @ prices.values[row])
@@ -267,9 +267,49 @@ def test_each_order_is_filled_after_the_lag_until_the_next_takes_its_place(lag, 
             idle = Fixed(np.eye(4)[0], model)
             plan = Allocation.of(idle, prices.between(None, row + 1), shares, cash)
             records.append(msgspec.structs.replace(record(plan, row), trades=trades.tolist()))
-    live = mark(records, prices.between(None, 40), model, lag, fill)
+    live = mark(records, prices.between(None, 40), model, lag, [fill] * len(records))
     np.testing.assert_allclose(live.wealth, wealth, rtol=1e-12)
     np.testing.assert_allclose(live.flows, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("fills", [(1, 1, 1), (2, 2, 2), (3, 1, 2)])
+def test_without_a_lag_an_order_takes_the_place_of_what_is_due_at_its_row(fills):
+    """Each of several strategies fills its orders over rows of its own."""
+    prices, model = table(), Proportional(0.001)
+    trades, rows = np.array([2.0, 1.0, 0.0]), (10, 11, 13)
+    shares, cash, wealth, records = np.zeros(3), 1e4, [], []
+    due: list[np.ndarray] = []
+    for row in range(10, 30):
+        if row > 10:
+            wealth.append(cash + shares @ prices.values[row])
+        if row in rows:
+            idle, fill = Fixed(np.eye(4)[0], model), fills[rows.index(row)]
+            plan = Allocation.of(idle, prices.between(None, row + 1), shares, cash)
+            records.append(msgspec.structs.replace(record(plan, row), trades=trades.tolist()))
+            due = [trades / fill] * fill
+        if due:
+            part = due.pop(0)
+            cash -= part @ prices.values[row] / (1 - 0.001)
+            shares = shares + part
+    live = mark(records, prices.between(None, 30), model, 0, fills)
+    np.testing.assert_allclose(live.wealth, wealth, rtol=1e-9)
+    np.testing.assert_allclose(live.flows, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("band", [0.0, 0.05])
+def test_an_allocation_within_the_band_leaves_what_remains_of_an_order(band):
+    prices, model = table(), Proportional(0.0)
+    target = np.array([0.1, 0.3, 0.4, 0.2])
+    order = Allocation.of(Fixed(target, model), prices.between(None, 11), np.zeros(3), 1e4)
+    shares = order.trades / 3  # the first part, without a lag
+    cash = 1e4 - shares @ prices.values[10]
+    held = np.append(cash, shares * prices.values[11])
+    still = Fixed(held / held.sum(), model)
+    nothing = Allocation.of(still, prices.between(None, 12), shares, cash)
+    assert not nothing.trades.any()
+    given = [record(order, 1), record(nothing, 2)], prices, model, 0, (3, 3), band
+    kept = 1e4 - order.trades @ prices.values[[10, 11, 12]].mean(0)
+    assert mark(*given).cash[-1] == pytest.approx(kept if band else cash)
 
 
 def test_a_split_and_a_deposit_earn_nothing():

@@ -139,15 +139,34 @@ class Desk:
             f"known on {day(last)}"
         )
 
+    def fill(self, name: str) -> int:
+        """Rows over which orders are filled: those of the user's own strategies at once."""
+        return 1 if self.kind(name) == "strategy" else self.run.any_task.terms.fill
+
     def spent(
         self, followed: Policy | Untrained, table: Prices, before: int | None = None
     ) -> float:
         """The ledger's turnover since the calendar year of a table's last row began.
 
-        It is 0 if the mandate does not limit turnover. before: as for ``Ledger.spent``.
+        Of an order that is filled over several rows, the parts of earlier rows count, until a later
+        order takes its place. It is 0 if the mandate does not limit turnover. before: number of a
+        record; only those before it count (default: all).
         """
-        limited = followed.task.written.trading.turnover_a_year is not None
-        return self.ledger.spent(table.dates[-1], before) if limited else 0.0
+        if followed.task.written.trading.turnover_a_year is None:
+            return 0.0
+        records = [record for record in self.ledger.current(before) if self._replaces(record)]
+        rows = np.searchsorted(table.dates, [record.moment for record in records]).tolist()
+        years, last = table.dates.astype("datetime64[Y]"), len(table) - 1
+        total = 0.0
+        for record, row, until in zip(records, rows, [*rows, last][1:], strict=True):
+            fill = self.fill(record.agent)
+            filled = years[row : min(row + fill, until, last)]
+            total += record.turnover * float((filled == years[-1]).sum()) / fill
+        return total
+
+    def _replaces(self, record: Record) -> bool:
+        """Whether a record takes the place of what remains of an earlier one."""
+        return any(record.trades) or not self.run.any_task.terms.band
 
     def terms(
         self, followed: Policy | Untrained, table: Prices, allocation: Allocation, spent: float
@@ -160,7 +179,8 @@ class Desk:
         if trading.fill > 1:
             said.append(
                 f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
-                "order at each of these rows."
+                "order at each of these rows. The expected cost is that of a single trade; fees of "
+                "each trade, and impact, differ."
             )
         if (most := trading.turnover_a_year) is not None:
             said.append(
@@ -201,7 +221,10 @@ class Desk:
         days, within = table.dates, band(calendar)
         if not allocation.trades.any():
             if abs(allocation.weights - allocation.held)[1:].max() > NOISE:
-                return ["Nothing is ordered: every trade is less than a whole share or lot."]
+                return [
+                    "Nothing is ordered: every trade is less than a whole share or lot, or costs "
+                    "more than it moves."
+                ]
             if within:
                 far = f"no weight is more than {within:g} from what is wanted"
                 return [f"Nothing is ordered: {far}."]

@@ -126,8 +126,8 @@ class Following:
             )
         if live.short:
             said.append(
-                f"After {amount(live.short, 'allocation')}, prices rose before the trades were "
-                "filled, so that cash became negative."
+                f"Cash became negative by {amount(live.short, 'trade')}: prices moved before they "
+                "were filled, or costs were higher than expected."
             )
         return said
 
@@ -210,7 +210,8 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
     agent, lag = records[-1].agent, run.config.lag
     known = desk.followed(agent, records[-1].policy)
     table = desk.table(known, prices)
-    live = mark(records, table, known.costs, lag, known.task.written.trading.fill)
+    fills = [desk.fill(record.agent) for record in records]
+    live = mark(records, table, known.costs, lag, fills, known.task.terms.band)
     other, count = run.config.benchmark, len(live.returns)
     tested, before = (_tested(desk, name, records[0]) for name in (agent, other))
     theirs, note = reference(desk, table, live.first - lag, count, benchmark)

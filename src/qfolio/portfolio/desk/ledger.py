@@ -65,6 +65,11 @@ class Record(msgspec.Struct, kw_only=True, frozen=True):
             raise ValueError("its lists do not fit its assets")
 
     @property
+    def turnover(self) -> float:
+        """Sum of the absolute changes in the weights of the assets bought and sold."""
+        return turnover(self.weights_before, self.weights_after, self.trades)
+
+    @property
     def moment(self) -> np.datetime64:
         """The date of its last prices."""
         return np.datetime64(self.date.replace(" ", "T"), "s")
@@ -81,32 +86,25 @@ class Ledger:
         paths = self.folder.glob("[0-9]*.json") if self.folder.is_dir() else ()
         return sorted(map(self._read, paths), key=lambda record: record.number)
 
-    def current(self) -> list[Record]:
-        """The record that counts for each date, in order of date."""
-        last = {record.moment: record for record in self.records()}
-        return [last[moment] for moment in sorted(last)]
+    def current(self, before: int | None = None) -> list[Record]:
+        """The record that counts for each date, in order of date.
 
-    def spent(self, moment: np.datetime64, before: int | None = None) -> float:
-        """The turnover ordered in the calendar year of a moment, up to but not at that moment.
-
-        before: number of a record; only those before it count (default: all).
+        before: number of a record; only those before it are known (default: all).
         """
-        known = [record for record in self.records() if before is None or record.number < before]
-        last = {record.moment: record for record in known}
-        year = moment.astype("datetime64[Y]")
-        return sum(
-            turnover(record.weights_before, record.weights_after, record.trades)
-            for record in last.values()
-            if record.moment < moment and record.moment.astype("datetime64[Y]") == year
-        )
+        last = {
+            record.moment: record
+            for record in self.records()
+            if before is None or record.number < before
+        }
+        return [last[moment] for moment in sorted(last)]
 
     def on(self, date: str) -> Record:
         """The record that counts for a date; for a day, that of its last moment.
 
         Raises QfolioError if there is none.
         """
-        found = [record for record in self.current() if record.date.startswith(date)]
-        if not found or not date:
+        found = [record for record in self.current() if date in (record.date, record.date[:10])]
+        if not found:
             known = ", ".join(record.date for record in self.current()[-3:])
             raise QfolioError(
                 f"The ledger has no allocation of {quote(date)}; "
@@ -152,6 +150,7 @@ class Ledger:
             differing = [
                 key for key, value in _inputs(record).items() if value != _inputs(before)[key]
             ]
+            differing = [key for key in differing if key != "orders"] or differing
             others = [f"{'other' if key[-1] == 's' else 'another'} {key}" for key in differing]
             said += (
                 f" It supersedes record {before.number} of the same date, which had "
@@ -244,8 +243,15 @@ def _of(allocation: Allocation) -> dict[str, Any]:
 
 
 def _inputs(record: Record | dict[str, Any]) -> dict[str, Any]:
-    """The inputs that determine an allocation."""
+    """What determines an allocation, and the orders that it came to."""
     content = record if isinstance(record, dict) else msgspec.structs.asdict(record)
     names = ("prices", "policy", "settings", "holdings")
     digests = {name: content["digests"].get(name) for name in names}
-    return {"agent": content["agent"], **digests, "rounding": content["whole_shares"]}
+    # Orders also depend on earlier records, where a mandate limits the turnover of a year.
+    orders = [float(f"{trade:.6g}") for trade in content["trades"]]
+    return {
+        "agent": content["agent"],
+        **digests,
+        "rounding": content["whole_shares"],
+        "orders": orders,
+    }

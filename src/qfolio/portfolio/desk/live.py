@@ -26,7 +26,7 @@ class Live:
     flows: np.ndarray  # holdings given to an allocation at the row before, less those expected
     gross: np.ndarray  # absolute values of assets, as a multiple of wealth; infinite without any
     first: int  # row of the table before the first return
-    short: int  # number of trades that left an overdraft: prices rose before they were filled
+    short: int  # number of trades that left an overdraft
 
     @property
     def ruin(self) -> np.datetime64 | None:
@@ -36,7 +36,12 @@ class Live:
 
 
 def mark(
-    records: Sequence[Record], prices: Prices, model: CostModel, lag: int, fill: int = 1
+    records: Sequence[Record],
+    prices: Prices,
+    model: CostModel,
+    lag: int,
+    fills: Sequence[int] = (),
+    band: float = 0.0,
 ) -> Live:
     """Follows the allocations of a ledger along a price table.
 
@@ -52,7 +57,10 @@ def mark(
         prices: A table with a row for each of these dates and the assets of the records.
         model: Costs of trading and holding.
         lag: Rows from an allocation to its trades.
-        fill: Rows over which the trades are filled, in equal parts.
+        fills: For each record, the rows over which its trades are filled, in equal parts (default:
+            one row).
+        band: Of the calendar. An allocation within it, which trades nothing, leaves what remains of
+            an earlier one.
 
     Raises:
         QfolioError: The ledger is empty, or prices do not fit it.
@@ -60,8 +68,8 @@ def mark(
     if not records:
         raise QfolioError("The ledger is empty; record an allocation with qfolio allocate first.")
     rows = np.searchsorted(prices.dates, [record.moment for record in records])
-    at: dict[int, Record] = {}
-    for row, record in zip(rows.tolist(), records, strict=True):
+    at: dict[int, tuple[Record, int]] = {}
+    for row, record, fill in zip(rows.tolist(), records, fills or [1] * len(rows), strict=True):
         if row == len(prices) or prices.dates[row] != record.moment:
             raise QfolioError(
                 f"The prices, {day(prices.dates[0])} to {day(prices.dates[-1])}, have no row of "
@@ -72,9 +80,9 @@ def mark(
                 f"Record {record.number} has other assets than the price table; give a table with "
                 "the record's."
             )
-        at[row] = record
+        at[row] = record, fill
     first = int(rows[0])
-    account = _Account(prices, model, lag, fill)
+    account = _Account(prices, model, lag, band)
     base = total = 0.0
     paid = flow = 0.0
     table: list[tuple[float, ...]] = []
@@ -86,13 +94,13 @@ def mark(
                 # As in the backtest, an account loses at most everything, and then earns nothing.
                 earned = max(total / base - 1, -1.0) if base > 0 else 0.0
                 table.append((earned, total, account.cash, paid, flow, account.gross(row)))
-        paid, flow = account.fill(row), 0.0
+        paid, flow = account.fill(row) if lag else 0.0, 0.0
         if row in at:
-            flow = account.take(at[row], row) - (total - paid)
+            flow = account.take(*at[row], row) - (total - paid)
             if row == first:
                 total, flow = total + flow, 0.0
-            if lag == 0:
-                paid += account.fill(row)
+        if lag == 0:  # parts of an earlier order that this row's takes the place of are not filled
+            paid = account.fill(row)
         base = total + flow
     returns, wealth, money, costs, flows, gross = np.array(table).reshape(-1, 6).T
     dates = prices.dates[first + lag + 1 :]
@@ -105,8 +113,8 @@ class _Account:
     short: number of trades that left an overdraft which was not wanted.
     """
 
-    def __init__(self, prices: Prices, model: CostModel, lag: int, rows: int) -> None:
-        self._model, self._lag, self._rows = model, lag, rows
+    def __init__(self, prices: Prices, model: CostModel, lag: int, band: float) -> None:
+        self._model, self._lag, self._band = model, lag, band
         self._values = np.nan_to_num(prices.values)
         self._known = Conditions.of(prices, model)
         self._due: dict[int, np.ndarray] = {}  # by row
@@ -136,16 +144,20 @@ class _Account:
             self.units = np.where(gone, 0.0, self.units)
             self._due = {then: np.where(gone, 0.0, part) for then, part in self._due.items()}
 
-    def take(self, record: Record, row: int) -> float:
-        """Takes an allocation's holdings and orders; returns the wealth of these holdings."""
+    def take(self, record: Record, fill: int, row: int) -> float:
+        """Takes an allocation's holdings and orders; returns the wealth of these holdings.
+
+        fill: rows over which the orders are filled.
+        """
         values, prices = self._values[row], np.array([price or 0.0 for price in record.prices])
         scale = np.divide(prices, values, out=np.ones(len(values)), where=values > 0)
         self._loan = record.target[0] < -1e-6
         self.units, self.cash = np.array(record.shares) * scale, record.cash
         # Earlier orders go on until this one takes the place of what is left of them.
-        first, part = row + self._lag, np.array(record.trades) * scale / self._rows
-        self._due = {then: parts for then, parts in self._due.items() if then < first}
-        self._due |= {first + later: part for later in range(self._rows)}
+        if any(record.trades) or not self._band:
+            first, part = row + self._lag, np.array(record.trades) * scale / fill
+            self._due = {then: parts for then, parts in self._due.items() if then < first}
+            self._due |= {first + later: part for later in range(fill)}
         return self.wealth(row)
 
     def fill(self, row: int) -> float:

@@ -110,7 +110,10 @@ def _schwab(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
     rows: Rows = []
     for i, instruction, quantity in _legs(allocation):
         if quantity != int(quantity):
-            raise QfolioError("An order at Schwab takes whole shares only; add --whole-shares.")
+            raise QfolioError(
+                "An order at Schwab takes whole shares only; add --whole-shares, or first trade "
+                f"what is held of {allocation.assets[i]} beyond whole shares."
+            )
         symbol = _symbol(allocation.assets[i], "/")
         rows.append([symbol, "EQUITY", instruction, int(quantity), "MARKET", "NORMAL", "DAY"])
     return header, rows
