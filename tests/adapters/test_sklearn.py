@@ -357,3 +357,37 @@ def test_a_fallback_takes_over():
     with pytest.warns(UserWarning, match="weights_ is set to None"):
         failed = model(raise_on_failure=False).fit(x[:8])
     assert np.isnan(failed.predict(x[8:20]).returns).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"calendar": "monthly"}, "calendar is 'monthly', and the estimator counts rows"),
+        ({"calendar": "21"}, "calendar is '21'"),
+        ({"mandate": {"trading": {"turnover_a_year": 0.2}}}, "limits the turnover of a calendar"),
+    ],
+)
+def test_what_depends_on_dates_is_refused(settings, says):
+    with pytest.raises(QfolioError, match=says):
+        model(settings={**TINY, **settings}).fit(returns())
+
+
+def test_a_mandate_with_short_sales_can_be_walked_forward():
+    mandate = {"assets": {"floor": {"A": -0.3}, "cap": {"A": -0.1}}}
+    short = model(settings={**TINY, "mandate": mandate, "calendar": "drift:0.01"})
+    folds = cross_val_predict(short, returns(), cv=WalkForward(train_size=TRAIN, test_size=15))
+    first, second = folds.portfolios
+    assert first.ending_weights[0] < -0.05
+    np.testing.assert_array_equal(second.previous_weights, first.ending_weights)
+
+
+def test_interest_moves_the_weights_at_the_end():
+    costs = "itemized(cash_rate=0.25)"
+    x = returns()
+    lends = model(max_weight=0.1, settings={**TINY, "cost_model": costs})  # most of it is cash
+    found = lends.fit(x[:TRAIN]).predict(x[TRAIN:])
+    before, after = found.simulation.weights[-1], found.ending_weights
+    grown = after / before[1:] / (1 + x.iloc[-1].to_numpy())
+    np.testing.assert_allclose(grown, grown[0], rtol=1e-12)
+    interest = (1 - after.sum()) / before[0] / grown[0] - 1
+    assert 0.25 / 365 / 2 < interest < 0.25 / 365 * 4  # of a day, or of one after a weekend

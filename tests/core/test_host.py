@@ -328,6 +328,7 @@ def test_returns_do_not_reach_from_a_cut_episode_into_a_new_one():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: GymnasiumTask(json.loads("3")), "id is 3; it must be the ID of an environment"),
         (lambda: GymnasiumTask("CartPoll-v1"), "no environment 'CartPoll-v1'; did you mean CartP"),
         (lambda: GymnasiumTask("Nowhere/X-v0"), "Nowhere"),
         (lambda: GymnasiumTask("no_such_module:X-v0"), "no_such_module cannot be imported"),

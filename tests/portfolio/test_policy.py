@@ -226,6 +226,9 @@ def test_odd_holdings_are_refused(policy):
                            ({"a": 0.5, "cash": 0.4}, "sum to 0.9")):  # fmt: skip
         with pytest.raises(QfolioError, match=said):
             policy.weights(table(), holdings)
+    for spent in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(QfolioError, match=f"spent is {spent}; it must be a number of at"):
+            policy.weights(table(), spent=spent)
 
 
 def test_programs_that_are_used_again_learn_the_same():

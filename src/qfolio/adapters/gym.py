@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from qfolio.core import settings, simplex
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.evaluation import step_key
 from qfolio.core.market import View
 from qfolio.core.mdp import Discrete, Simplex
@@ -132,6 +132,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Starts an episode in cash, at a row from ``first`` to ``last``: drawn, or ``start``."""
         super().reset(seed=seed)
+        if options is not None:
+            require_type("options", options, dict, 'a dictionary, such as {"start": 100}')
         if unknown := sorted({*(options or {})} - {"start"}):
             raise QfolioError(f"options has {unknown[0]!r}; the only option of reset is 'start'.")
         start = (options or {}).get("start")

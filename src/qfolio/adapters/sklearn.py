@@ -19,8 +19,10 @@ from qfolio.core.registry import find
 from qfolio.core.settings import names
 from qfolio.experiments import presets
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
+from qfolio.portfolio.calendars import band
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.costs import drift, grown
+from qfolio.portfolio.costs import grown
+from qfolio.portfolio.mandate.limits import feasible, mandate_text, parse
 from qfolio.portfolio.prices.frequency import dated, periods_per_year
 from qfolio.portfolio.prices.table import Prices
 
@@ -173,6 +175,7 @@ class PortfolioPolicy(BaseOptimization):
         require_whole("lag", self.lag, 0, len(returns) - 1)
         require_type("settings", self.settings or {}, Mapping, "a dict of settings by name")
         chosen, task = self._chosen()
+        self.debts_ = self._allows_debts(chosen, task)
         self._held()  # rejects invalid holdings before training
         self.returns_, self.observations_ = returns, _dates(X)
         self.periods_per_year_ = _frequency(self.observations_)
@@ -225,7 +228,7 @@ class PortfolioPolicy(BaseOptimization):
         if self.weights_ is None or getattr(self, "fallback_", None) is not None:
             return super().predict(X)
         returns = validate_data(self, X, reset=False, dtype=np.float64)
-        simulation = self._followed(self._before(X), returns)
+        simulation, ending = self._followed(self._before(X), returns)
         params = dict(self.portfolio_params or {})
         for name in ("transaction_costs", "management_fees", "previous_weights"):
             if name in params:
@@ -236,7 +239,7 @@ class PortfolioPolicy(BaseOptimization):
         params.pop("weight_drift", None)  # a policy's weights always drift
         params.setdefault("name", type(self).__name__)
         previous = self._held()[1:]
-        return PolicyPortfolio(X, simulation, previous_weights=previous, **params)
+        return PolicyPortfolio(X, simulation, ending, previous_weights=previous, **params)
 
     def _chosen(self) -> tuple[presets.Preset, dict[str, Any]]:
         """The preset with the settings that were changed, and the task's own parameters."""
@@ -251,6 +254,29 @@ class PortfolioPolicy(BaseOptimization):
         own = {"cost": self.cost, "lag": self.lag, "max_weight": self.max_weight}
         task = {**own, **window, **of_task}
         return chosen._replace(settings={**chosen.settings, **of_agent}), task
+
+    def _allows_debts(self, chosen: presets.Preset, task: Mapping[str, Any]) -> bool:
+        """Whether the mandate allows loans or short sales.
+
+        Raises QfolioError for what depends on dates, because rows here are only counted.
+        """
+        calendar = {**chosen.task, **task}.get("calendar", "")
+        if calendar and not band(calendar):
+            raise QfolioError(
+                f"calendar is {calendar!r}, and the estimator counts rows without their dates; "
+                "take a band such as drift:0.05, or test the calendar with qfolio.Backtest."
+            )
+        if not task.get("mandate"):
+            return False
+        text = mandate_text(task["mandate"], self._assets())
+        if parse(text)[1].trading.turnover_a_year is not None:
+            raise QfolioError(
+                "The mandate limits the turnover of a calendar year, and the estimator counts rows "
+                "without their dates; leave trading.turnover_a_year out, or test the mandate with "
+                "qfolio.Backtest."
+            )
+        every = np.ones(self.n_features_in_, bool)
+        return not feasible(text, every, self.max_weight).long_only
 
     def _learned(self) -> Prices:
         """Prices of the rows to learn from: those up to the first decision of a prediction."""
@@ -267,11 +293,14 @@ class PortfolioPolicy(BaseOptimization):
     def _held(self) -> np.ndarray:
         """``previous_weights`` with cash first, of shape (n_assets + 1,).
 
-        Raises ValueError if a weight is negative or their sum exceeds 1.
+        Raises ValueError if a weight is negative or their sum exceeds 1, unless the mandate allows
+        debts.
         """
         weights = np.zeros(self.n_features_in_)
         if self.previous_weights is not None:
             weights = self._clean_previous_weights(n_assets=self.n_features_in_)
+        if self.debts_ and np.isfinite(weights).all():
+            return np.append(1 - weights.sum(), weights)
         if not (weights >= -1e-9).all() or not weights.sum() <= 1 + 1e-6:
             raise ValueError("previous_weights must not be negative, nor sum to more than 1.")
         weights = np.maximum(weights, 0)
@@ -298,7 +327,8 @@ class PortfolioPolicy(BaseOptimization):
                 ) from None
             return self.returns_
 
-    def _followed(self, before: np.ndarray, returns: np.ndarray) -> Simulation:
+    def _followed(self, before: np.ndarray, returns: np.ndarray) -> tuple[Simulation, np.ndarray]:
+        """The record of the policy over some rows, and the weights at their end, cash first."""
         task, days = self.policy_.task, len(returns)
         window, lag = task.window, task.lag
         # Rows missing before the first decision's window; their returns are zero.
@@ -320,7 +350,7 @@ class PortfolioPolicy(BaseOptimization):
             first = last - lag + missing
             held = grown(start, growth(start, last - lag, first))
             decisions[missing:], _ = self.policy_.decide(prices, first, held, days - missing)
-        return simulate(
+        simulation = simulate(
             values,
             decisions,
             first=last - lag,
@@ -330,6 +360,8 @@ class PortfolioPolicy(BaseOptimization):
             conditions=known,
             long_only=task.feasible.long_only,
         )
+        traded, end = simulation.weights[-1], len(values) - 1
+        return simulation, grown(traded, growth(traded, end - 1, end))
 
 
 class PolicyPortfolio(Portfolio):
@@ -340,10 +372,11 @@ class PolicyPortfolio(Portfolio):
     day.
     """
 
-    __slots__ = {"simulation"}
-    _read_only_attrs = Portfolio._read_only_attrs | {"simulation"}
+    __slots__ = {"ending", "simulation"}
+    _read_only_attrs = Portfolio._read_only_attrs | {"ending", "simulation"}
 
-    def __init__(self, X: Any, simulation: Simulation, **params: Any) -> None:
+    def __init__(self, X: Any, simulation: Simulation, ending: np.ndarray, **params: Any) -> None:
+        """ending: weights after the last row, cash first."""
         if "weights" in params:
             raise TypeError(
                 "The weights of a policy change from day to day; its portfolio cannot be scaled, "
@@ -351,10 +384,10 @@ class PolicyPortfolio(Portfolio):
             )
         path = simulation.weights[:, 1:]
         super().__init__(X, weights=path.mean(0), weight_drift=True, **params)
-        last = 1 + np.asarray(X, dtype=float)[-1]
         own = {
             "returns": simulation.returns,
-            "ending_weights": drift(simulation.weights[-1], last)[1:],
+            "ending_weights": ending[1:],
+            "ending": ending,
             "simulation": simulation,
             "_weights_path": path,
         }
@@ -375,7 +408,8 @@ class PolicyPortfolio(Portfolio):
         kept = set(inspect.signature(Portfolio.__init__).parameters)
         kept -= {"self", "kwargs", "weights", "weight_drift", "sample_weight"}
         params = {name: getattr(self, name) for name in sorted(kept)}
-        return {**params, "sample_weight": self._sample_weight, "simulation": self.simulation}
+        own = {"simulation": self.simulation, "ending": self.ending}
+        return {**params, "sample_weight": self._sample_weight, **own}
 
 
 def _dates(X: Any) -> Any:

@@ -37,6 +37,7 @@ class GymnasiumTask(HostTask):
     horizon: int = static(0)  # steps of an episode; 0: the environment's limit
 
     def __post_init__(self) -> None:
+        require_type("id", self.id, str, "the ID of an environment, such as 'CartPole-v1'")
         require_type("kwargs", self.kwargs, str, "JSON, such as '{\"continuous\": true}'")
         if not self.horizon:
             self.horizon = self.facts.limit

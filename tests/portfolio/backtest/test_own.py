@@ -221,6 +221,12 @@ def test_forms_of_returns():
         own = read_own("mine", source, table())
         assert own.kind == "returns"
         np.testing.assert_array_equal(own.values, series.to_numpy())
+    # A series of returns is one whatever it is called, such as an asset's pct_change().
+    for name in (None, "A", "fund"):
+        moved = series.rename(name).where(np.arange(ROWS) > 0)
+        own = read_own("mine", moved, table())
+        assert own.kind == "returns"
+        np.testing.assert_array_equal(own.values, series.to_numpy()[1:])
 
 
 HOURS = Prices(np.datetime64("2020-01-01T09:30", "s") + np.arange(ROWS) * np.timedelta64(1, "h"),

@@ -44,7 +44,8 @@ def read_own(name: str, source: Any, prices: Prices) -> Own:
 
     Args:
         name: Name of the strategy, for messages.
-        source: Path of a CSV or Parquet file; a data frame that narwhals knows; or an array with a
+        source: Path of a CSV or Parquet file; a data frame that narwhals knows; a pandas Series of
+            returns by date; or an array with a
             row for each row of the prices: weights of shape (rows, N + 1), cash first, or (rows,
             N), NaN for no order, or returns of shape (rows,).
         prices: The table.
@@ -60,6 +61,8 @@ def read_own(name: str, source: Any, prices: Prices) -> Own:
             "jaxlib",
         ):
             return _from_array(source, prices)
+        if type(source).__module__.startswith("pandas") and source.ndim == 1:
+            source = source.dropna().to_frame("return")  # whatever its name, such as an asset's
         return _from_table(source, prices)
     except QfolioError as error:
         raise QfolioError(f"Strategy {quote(name)}: {error}") from None
