@@ -362,8 +362,8 @@ def test_a_fallback_takes_over():
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"calendar": "monthly"}, "calendar is 'monthly', and the estimator counts rows"),
-        ({"calendar": "21"}, "calendar is '21'"),
+        ({"calendar": "monthly"}, "calendar is monthly, and the estimator counts rows"),
+        ({"calendar": "21"}, "calendar is 21, and"),
         ({"mandate": {"trading": {"turnover_a_year": 0.2}}}, "limits the turnover of a calendar"),
     ],
 )

@@ -502,7 +502,7 @@ def test_a_budget_of_the_year_is_that_of_the_ledger(tmp_path, monkeypatch, capsy
     first = json.loads(printed.out)
     assert "fills orders over 3 rows" in printed.err
     assert "orders have used 0.0% this year, and this one uses 90.0%" in printed.err
-    assert "The expected cost is that of a single trade" in printed.err
+    assert "The expected cost assumes a single trade" in printed.err
     assert first["spent"] == 0
     assert sum(row["weight"] for row in first["assets"]) == pytest.approx(0.9)  # the whole order
     # A row later one of three parts is filled, and then another one.

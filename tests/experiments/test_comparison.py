@@ -184,7 +184,7 @@ def test_an_agent_whose_seeds_mostly_end_better_is_named():
     ahead[11:] = -1e8
     said = conclusion(rank({"a": result(ahead), "b": result(-102 - np.arange(15) / 100)}))
     assert said[0].startswith("b ends nearest")
-    assert said[1].startswith("Most seeds of a (")
+    assert said[1].startswith("A seed of a (")
     assert "told apart" not in " ".join(said)
 
 

@@ -13,7 +13,7 @@ from qfolio.experiments import log as logs
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.events import EVENTS, read
 from qfolio.experiments.fit import fit
-from qfolio.experiments.log import Log, Tracker, means, tracked
+from qfolio.experiments.log import Log, Tracker, _parts, means, tracked
 from qfolio.experiments.machines.messages import Report
 from qfolio.experiments.machines.remote import RemoteTraining, hear
 from qfolio.experiments.records import Records
@@ -183,6 +183,15 @@ def test_a_record_has_every_member_and_the_step_of_its_episodes(tmp_path, enviro
         episode = record["values"]["episode"]
         assert episode == [record["step"] / 4] * 3
         assert record["share"] == pytest.approx(episode[0] / (50 * environments), abs=1e-3)
+
+
+def test_episodes_of_any_length_make_records_of_several_members():
+    ends = np.sort(np.random.default_rng(0).permutation(400)[:40])
+    parts = _parts(ends, 50, members=4)
+    assert [part.stop - part.start for part in parts] == [4] * 10
+    assert parts[-1].stop == 40
+    many = _parts(np.arange(10_000), 10, members=200)
+    assert {part.stop - part.start for part in many} == {800}  # four for each member
 
 
 def test_trackers_hear_means_over_members(tmp_path):

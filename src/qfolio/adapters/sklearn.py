@@ -239,7 +239,7 @@ class PortfolioPolicy(BaseOptimization):
         params.pop("weight_drift", None)  # a policy's weights always drift
         params.setdefault("name", type(self).__name__)
         previous = self._held()[1:]
-        return PolicyPortfolio(X, simulation, ending, previous_weights=previous, **params)
+        return PolicyPortfolio(X, simulation, ending[1:], previous_weights=previous, **params)
 
     def _chosen(self) -> tuple[presets.Preset, dict[str, Any]]:
         """The preset with the settings that were changed, and the task's own parameters."""
@@ -260,11 +260,12 @@ class PortfolioPolicy(BaseOptimization):
 
         Raises QfolioError for what depends on dates, because rows here are only counted.
         """
-        calendar = {**chosen.task, **task}.get("calendar", "")
+        calendar = str({**chosen.task, **task}.get("calendar", ""))
         if calendar and not band(calendar):
             raise QfolioError(
-                f"calendar is {calendar!r}, and the estimator counts rows without their dates; "
-                "take a band such as drift:0.05, or test the calendar with qfolio.Backtest."
+                f"calendar is {calendar}, and the estimator counts rows from wherever its returns "
+                "begin, without dates; take a band such as drift:0.05, or test the calendar with "
+                "qfolio.Backtest."
             )
         if not task.get("mandate"):
             return False
@@ -299,7 +300,7 @@ class PortfolioPolicy(BaseOptimization):
         weights = np.zeros(self.n_features_in_)
         if self.previous_weights is not None:
             weights = self._clean_previous_weights(n_assets=self.n_features_in_)
-        if self.debts_ and np.isfinite(weights).all():
+        if getattr(self, "debts_", False) and np.isfinite(weights).all():
             return np.append(1 - weights.sum(), weights)
         if not (weights >= -1e-9).all() or not weights.sum() <= 1 + 1e-6:
             raise ValueError("previous_weights must not be negative, nor sum to more than 1.")
@@ -372,11 +373,13 @@ class PolicyPortfolio(Portfolio):
     day.
     """
 
-    __slots__ = {"ending", "simulation"}
-    _read_only_attrs = Portfolio._read_only_attrs | {"ending", "simulation"}
+    __slots__ = {"simulation"}
+    _read_only_attrs = Portfolio._read_only_attrs | {"simulation"}
 
-    def __init__(self, X: Any, simulation: Simulation, ending: np.ndarray, **params: Any) -> None:
-        """ending: weights after the last row, cash first."""
+    def __init__(
+        self, X: Any, simulation: Simulation, ending_weights: np.ndarray, **params: Any
+    ) -> None:
+        """ending_weights: after the last row, of shape (n_assets,)."""
         if "weights" in params:
             raise TypeError(
                 "The weights of a policy change from day to day; its portfolio cannot be scaled, "
@@ -386,8 +389,7 @@ class PolicyPortfolio(Portfolio):
         super().__init__(X, weights=path.mean(0), weight_drift=True, **params)
         own = {
             "returns": simulation.returns,
-            "ending_weights": ending[1:],
-            "ending": ending,
+            "ending_weights": ending_weights,
             "simulation": simulation,
             "_weights_path": path,
         }
@@ -408,7 +410,7 @@ class PolicyPortfolio(Portfolio):
         kept = set(inspect.signature(Portfolio.__init__).parameters)
         kept -= {"self", "kwargs", "weights", "weight_drift", "sample_weight"}
         params = {name: getattr(self, name) for name in sorted(kept)}
-        own = {"simulation": self.simulation, "ending": self.ending}
+        own = {"simulation": self.simulation, "ending_weights": self.ending_weights}
         return {**params, "sample_weight": self._sample_weight, **own}
 
 

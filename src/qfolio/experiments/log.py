@@ -29,7 +29,8 @@ PARTS = 50
 """Minimum number of records of a training with enough episodes; long chunks are split."""
 
 RECENT = 500
-"""A record's means are of the latest episodes: so many, or more that ended at the same step."""
+"""A record's means are of the latest episodes: so many, or more that ended at the same step (four
+per member if that is more)."""
 
 
 class Tracker:
@@ -208,7 +209,8 @@ class JobLog(Listener):
     def _flush(self, training: Training) -> None:
         rows, members, ends = Records.joined(self._rows), self._of, self._ends
         step, share = training.steps, training.share
-        for some in _parts(ends, math.ceil(PARTS * (share - self._share))):
+        parts = math.ceil(PARTS * (share - self._share))
+        for some in _parts(np.array(ends, int), parts, max(1, len(self.members))):
             at = step if some.stop == len(rows) else ends[some.stop - 1]
             done = (at - self._step) / max(step - self._step, 1)
             self.record(
@@ -221,17 +223,18 @@ class JobLog(Listener):
         self._rows, self._of, self._ends, self._step, self._share = [], [], [], step, share
 
 
-def _parts(ends: Sequence[int], count: int) -> list[slice]:
+def _parts(ends: np.ndarray, count: int, members: int) -> list[slice]:
     """The latest rows of each of ``count`` parts of some rows, or fewer.
 
-    Rows whose episodes end at the same step stay together: they are of several members.
+    A part has a row for each member on average, and rows whose episodes end at the same step stay
+    together: they are of several members.
     """
-    if not ends:
+    if not len(ends):
         return [slice(0, 0)]
-    count, found, begin = max(1, min(count, len(ends))), [], 0
-    last = [ends[len(ends) * (part + 1) // count - 1] for part in range(count)]
+    count, found, begin = max(1, min(count, len(ends) // members)), [], 0
+    last = ends[len(ends) * np.arange(1, count + 1) // count - 1]
     for stop in np.unique(np.searchsorted(ends, last, "right")).tolist():
-        recent = int(np.searchsorted(ends, ends[max(stop - RECENT, 0)]))
+        recent = int(np.searchsorted(ends, ends[max(stop - max(RECENT, 4 * members), 0)]))
         found.append(slice(max(begin, recent), stop))
         begin = stop
     return found

@@ -141,7 +141,7 @@ class Policy:
             QfolioError: The assets are not those of the policy, or prices are missing in its
                 window.
         """
-        if not isinstance(spent, Real) or not 0 <= float(spent) < float("inf"):
+        if not 0 <= spent < float("inf"):
             raise QfolioError(f"spent is {spent!r}; it must be a number of at least 0.")
         table = self.table(prices, **options)
         held, last = self.holdings(holdings), len(table) - 1

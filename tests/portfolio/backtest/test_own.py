@@ -227,6 +227,8 @@ def test_forms_of_returns():
         own = read_own("mine", moved, table())
         assert own.kind == "returns"
         np.testing.assert_array_equal(own.values, series.to_numpy()[1:])
+    index = (3000 * (1 + series).cumprod()).rename("SPX")
+    assert read_own("mine", index, table()).kind == "levels"
 
 
 HOURS = Prices(np.datetime64("2020-01-01T09:30", "s") + np.arange(ROWS) * np.timedelta64(1, "h"),

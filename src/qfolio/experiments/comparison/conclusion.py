@@ -41,7 +41,9 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
             f"{each.capitalize()} {none} be told apart, whatever their results; this needs "
             f"{ranking['seeds_needed']} seeds or more."
         )
-    ahead = f"Most seeds of {listed(better)} end better, though." if better else ""
+    ahead = ""
+    if better:
+        ahead = f"A seed of {listed(better, 'or')} is more likely to end better, though."
     result = f"{best} {result_of(ranking, first, interval=True)}."
     said = [result, sentence, ahead, _quickest(ranking)]
     return [each for each in said if each]

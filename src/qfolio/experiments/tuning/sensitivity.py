@@ -69,7 +69,7 @@ class Outcome:
         return max(abs(self.best if self.optimum is None else self.optimum), 1e-12)
 
     def height(self, returns: ArrayLike) -> Floats:
-        """Heights of returns; NaN counts as clearly worse than the worst."""
+        """Heights of returns; NaN is worse than the worst by more than is tolerated."""
         values = np.asarray(returns, float)
         if self.optimum is None:
             values = np.maximum(values, self.floor)

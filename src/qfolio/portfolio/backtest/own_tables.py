@@ -45,9 +45,9 @@ def read_own(name: str, source: Any, prices: Prices) -> Own:
     Args:
         name: Name of the strategy, for messages.
         source: Path of a CSV or Parquet file; a data frame that narwhals knows; a pandas Series of
-            returns by date; or an array with a
-            row for each row of the prices: weights of shape (rows, N + 1), cash first, or (rows,
-            N), NaN for no order, or returns of shape (rows,).
+            returns or of an index, by date; or an array with a row for each row of the prices:
+            weights of shape (rows, N + 1), cash first, or (rows, N), NaN for no order, or returns
+            of shape (rows,).
         prices: The table.
 
     Raises:
@@ -62,7 +62,9 @@ def read_own(name: str, source: Any, prices: Prices) -> Own:
         ):
             return _from_array(source, prices)
         if type(source).__module__.startswith("pandas") and source.ndim == 1:
-            source = source.dropna().to_frame("return")  # whatever its name, such as an asset's
+            # Whatever its name, such as an asset's. Half of all returns are surely below 30%.
+            known = source.dropna()
+            source = known.to_frame("return" if abs(known).median() < 0.3 else "level")
         return _from_table(source, prices)
     except QfolioError as error:
         raise QfolioError(f"Strategy {quote(name)}: {error}") from None

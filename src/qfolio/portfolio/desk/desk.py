@@ -154,19 +154,19 @@ class Desk:
         """
         if followed.task.written.trading.turnover_a_year is None:
             return 0.0
-        records = [record for record in self.ledger.current(before) if self._replaces(record)]
+        band = self.run.any_task.terms.band
+        records = [record for record in self.ledger.current(before) if record.replaces(band)]
         rows = np.searchsorted(table.dates, [record.moment for record in records]).tolist()
         years, last = table.dates.astype("datetime64[Y]"), len(table) - 1
         total = 0.0
         for record, row, until in zip(records, rows, [*rows, last][1:], strict=True):
             fill = self.fill(record.agent)
             filled = years[row : min(row + fill, until, last)]
-            total += record.turnover * float((filled == years[-1]).sum()) / fill
+            share = float((filled == years[-1]).sum()) / fill
+            if record.moment < table.dates[0]:  # the table does not say which parts were filled
+                share = float(record.moment.astype("datetime64[Y]") == years[-1])
+            total += share * record.turnover
         return total
-
-    def _replaces(self, record: Record) -> bool:
-        """Whether a record takes the place of what remains of an earlier one."""
-        return any(record.trades) or not self.run.any_task.terms.band
 
     def terms(
         self, followed: Policy | Untrained, table: Prices, allocation: Allocation, spent: float
@@ -175,12 +175,12 @@ class Desk:
         trading = followed.task.written.trading
         said = self._timing(followed, table, allocation)
         if allocation.trades.any():
-            said += [*waiting(table, self.run.config.lag), *self._pending(table, trading.fill)]
+            said += [*waiting(table, self.run.config.lag), *self._pending(table)]
         if trading.fill > 1:
             said.append(
                 f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
-                "order at each of these rows. The expected cost is that of a single trade; fees of "
-                "each trade, and impact, differ."
+                "order at each of these rows. The expected cost assumes a single trade; fees per "
+                "trade and market impact will differ."
             )
         if (most := trading.turnover_a_year) is not None:
             said.append(
@@ -189,18 +189,16 @@ class Desk:
             )
         return said
 
-    def _pending(self, table: Prices, fill: int) -> list[str]:
-        """Says so if parts of earlier orders are filled between a table's last row and its trade.
-
-        fill: rows over which an order is filled.
-        """
+    def _pending(self, table: Prices) -> list[str]:
+        """Says so if parts of earlier orders are filled between the last row and its trade."""
         last, lag = len(table) - 1, self.run.config.lag
         if lag < 2:
             return []
         records = [record for record in self.ledger.current() if any(record.trades)]
         moments = np.array([record.moment for record in records], table.dates.dtype)
         rows = np.searchsorted(table.dates, moments)
-        pending = (rows < last) & (last < rows + lag + fill - 1)
+        fills = np.array([self.fill(record.agent) for record in records], int)
+        pending = (rows < last) & (last < rows + lag + fills - 1)
         dates = [record.date for record, yes in zip(records, pending, strict=True) if yes]
         if not dates:
             return []

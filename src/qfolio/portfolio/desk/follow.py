@@ -126,8 +126,8 @@ class Following:
             )
         if live.short:
             said.append(
-                f"Cash became negative by {amount(live.short, 'trade')}: prices moved before they "
-                "were filled, or costs were higher than expected."
+                f"Cash became negative after {amount(live.short, 'trade')}: prices moved before "
+                "they were filled, or costs were higher than expected."
             )
         return said
 

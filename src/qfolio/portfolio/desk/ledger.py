@@ -64,6 +64,13 @@ class Record(msgspec.Struct, kw_only=True, frozen=True):
         if any(len(x) != count for x in lists) or any(len(x) != count + 1 for x in weights):
             raise ValueError("its lists do not fit its assets")
 
+    def replaces(self, band: float) -> bool:
+        """Whether it takes the place of what remains of an earlier order.
+
+        band: of the calendar, within which nothing is ordered.
+        """
+        return any(self.trades) or not band
+
     @property
     def turnover(self) -> float:
         """Sum of the absolute changes in the weights of the assets bought and sold."""
@@ -115,7 +122,7 @@ class Ledger:
     def append(
         self, allocation: Allocation, prices: Prices, *, keep_prices: bool, **facts: Any
     ) -> tuple[Record, str]:
-        """Adds a record, unless the last one of the same date has the same inputs.
+        """Adds a record, unless the last one of the same date has the same inputs and orders.
 
         Args:
             allocation: The allocation.
@@ -131,7 +138,7 @@ class Ledger:
             records = self.records()
             content = {**_of(allocation), **facts}
             before = next((r for r in reversed(records) if r.date == content["date"]), None)
-            if before is not None and _inputs(before) == _inputs(content):
+            if before is not None and not (differing := _differing(before, content)):
                 return before, f"This allocation is already record {before.number} of the ledger."
             record = msgspec.convert(
                 {
@@ -147,10 +154,6 @@ class Ledger:
             write_json(path, msgspec.to_builtins(record))
         said = f"Recorded in the ledger as {path}."
         if before is not None:
-            differing = [
-                key for key, value in _inputs(record).items() if value != _inputs(before)[key]
-            ]
-            differing = [key for key in differing if key != "orders"] or differing
             others = [f"{'other' if key[-1] == 's' else 'another'} {key}" for key in differing]
             said += (
                 f" It supersedes record {before.number} of the same date, which had "
@@ -243,15 +246,19 @@ def _of(allocation: Allocation) -> dict[str, Any]:
 
 
 def _inputs(record: Record | dict[str, Any]) -> dict[str, Any]:
-    """What determines an allocation, and the orders that it came to."""
+    """The inputs that determine an allocation."""
     content = record if isinstance(record, dict) else msgspec.structs.asdict(record)
     names = ("prices", "policy", "settings", "holdings")
     digests = {name: content["digests"].get(name) for name in names}
-    # Orders also depend on earlier records, where a mandate limits the turnover of a year.
-    orders = [float(f"{trade:.6g}") for trade in content["trades"]]
-    return {
-        "agent": content["agent"],
-        **digests,
-        "rounding": content["whole_shares"],
-        "orders": orders,
-    }
+    return {"agent": content["agent"], **digests, "rounding": content["whole_shares"]}
+
+
+def _differing(before: Record, content: dict[str, Any]) -> list[str]:
+    """The inputs of an allocation that differ from those of a record, or else "orders" if they do.
+
+    Orders also depend on earlier records, where a mandate limits the turnover of a year.
+    """
+    now = _inputs(content)
+    inputs = [key for key, value in _inputs(before).items() if value != now[key]]
+    same = np.allclose(before.weights_after, content["weights_after"], rtol=0, atol=1e-5)
+    return inputs or ([] if same else ["orders"])

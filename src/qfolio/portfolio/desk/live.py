@@ -154,7 +154,7 @@ class _Account:
         self._loan = record.target[0] < -1e-6
         self.units, self.cash = np.array(record.shares) * scale, record.cash
         # Earlier orders go on until this one takes the place of what is left of them.
-        if any(record.trades) or not self._band:
+        if record.replaces(self._band):
             first, part = row + self._lag, np.array(record.trades) * scale / fill
             self._due = {then: parts for then, parts in self._due.items() if then < first}
             self._due |= {first + later: part for later in range(fill)}

@@ -178,10 +178,15 @@ def _covariance(x: Floats, y: Floats, rows: int) -> Floats:
 
 
 def _deviation(values: Floats, rows: int) -> Floats:
-    """The standard deviation; 0 where it is only the rounding of equal values."""
+    """The standard deviation; 0 where all values are equal, up to rounding."""
     window = _rolling(values, rows)
-    found, mean = window.std(ddof=0).to_numpy(), window.mean().to_numpy()
-    return np.where(found > ROUNDING * abs(mean), found, 0 * found)
+    found, mean = np.array(window.std(ddof=0)), window.mean().to_numpy()
+    # Its running sums leave a residue of earlier values, which extremes do not.
+    if (few := (found < 1e-6 * abs(mean)).any(0)).any():
+        some = _rolling(values[:, few], rows)
+        spread = (some.max() - some.min()).to_numpy()
+        found[:, few] = np.where(spread > ROUNDING * abs(mean[:, few]), found[:, few], 0 * spread)
+    return found
 
 
 def _slope(returns: Floats, market: Floats, rows: int) -> Floats:
