@@ -370,6 +370,8 @@ def test_verdict() -> None:
     known = {**summary, "return_per_seed": [-141.0] * 5, "return_ci95": [-142.0, -140.0]}
     assert "(95% interval \N{MINUS SIGN}142.0 to" in verdict(known)
     assert "above the exact" in verdict({**summary, "regret_per_seed": [-0.01, -0.02]})
+    zero = {**summary, "optimum": 0.0, "regret_per_seed": [math.inf, math.inf]}
+    assert verdict(zero).endswith("), where the exact optimum is 0.0.")
     assert "equal to the exact" in verdict({**summary, "regret_per_seed": [1e-5, -1e-5]})
     assert verdict({**summary, "return_per_seed": [0.0] * 64}).startswith("64 agents")
 

@@ -175,7 +175,7 @@ class PortfolioPolicy(BaseOptimization):
         require_whole("lag", self.lag, 0, len(returns) - 1)
         require_type("settings", self.settings or {}, Mapping, "a dict of settings by name")
         chosen, task = self._chosen()
-        self.debts_ = self._allows_debts(chosen, task)
+        self.debts_ = self._allows_debts({**chosen.task, **task})
         self._held()  # rejects invalid holdings before training
         self.returns_, self.observations_ = returns, _dates(X)
         self.periods_per_year_ = _frequency(self.observations_)
@@ -255,29 +255,13 @@ class PortfolioPolicy(BaseOptimization):
         task = {**own, **window, **of_task}
         return chosen._replace(settings={**chosen.settings, **of_agent}), task
 
-    def _allows_debts(self, chosen: presets.Preset, task: Mapping[str, Any]) -> bool:
-        """Whether the mandate allows loans or short sales.
-
-        Raises QfolioError for what depends on dates, because rows here are only counted.
-        """
-        calendar = str({**chosen.task, **task}.get("calendar", ""))
-        if calendar and not band(calendar):
-            raise QfolioError(
-                f"calendar is {calendar}, and the estimator counts rows from wherever its returns "
-                "begin, without dates; take a band such as drift:0.05, or test the calendar with "
-                "qfolio.Backtest."
-            )
-        if not task.get("mandate"):
-            return False
-        text = mandate_text(task["mandate"], self._assets())
-        if parse(text)[1].trading.turnover_a_year is not None:
-            raise QfolioError(
-                "The mandate limits the turnover of a calendar year, and the estimator counts rows "
-                "without their dates; leave trading.turnover_a_year out, or test the mandate with "
-                "qfolio.Backtest."
-            )
+    def _allows_debts(self, task: Mapping[str, Any]) -> bool:
+        """Whether the mandate allows loans or short sales; refuses settings that need dates."""
+        given = task.get("mandate")
+        text = mandate_text(given, self._assets()) if given else ""
+        _require_undated(str(task.get("calendar", "")), text)
         every = np.ones(self.n_features_in_, bool)
-        return not feasible(text, every, self.max_weight).long_only
+        return bool(text) and not feasible(text, every, self.max_weight).long_only
 
     def _learned(self) -> Prices:
         """Prices of the rows to learn from: those up to the first decision of a prediction."""
@@ -300,7 +284,7 @@ class PortfolioPolicy(BaseOptimization):
         weights = np.zeros(self.n_features_in_)
         if self.previous_weights is not None:
             weights = self._clean_previous_weights(n_assets=self.n_features_in_)
-        if getattr(self, "debts_", False) and np.isfinite(weights).all():
+        if self.debts_ and np.isfinite(weights).all():
             return np.append(1 - weights.sum(), weights)
         if not (weights >= -1e-9).all() or not weights.sum() <= 1 + 1e-6:
             raise ValueError("previous_weights must not be negative, nor sum to more than 1.")
@@ -438,6 +422,22 @@ def _frequency(labels: Any) -> float:
     labels = labels.to_timestamp() if hasattr(labels, "to_timestamp") else labels  # of periods
     dates = labels.to_numpy("datetime64[s]") if _are_dates(labels) else np.zeros(0, "M8[s]")
     return periods_per_year(dates)
+
+
+def _require_undated(calendar: str, mandate: str) -> None:
+    """Raises QfolioError for settings that depend on dates: rows here are only counted."""
+    if calendar and not band(calendar):
+        raise QfolioError(
+            f"calendar is {calendar}, and the estimator counts rows from wherever its returns "
+            "begin, without dates; take a band such as drift:0.05, or test the calendar with "
+            "qfolio.Backtest."
+        )
+    if mandate and parse(mandate)[1].trading.turnover_a_year is not None:
+        raise QfolioError(
+            "The mandate limits the turnover of a calendar year, and the estimator counts rows "
+            "without their dates; leave trading.turnover_a_year out, or test the mandate with "
+            "qfolio.Backtest."
+        )
 
 
 def _require_returns(returns: np.ndarray) -> None:

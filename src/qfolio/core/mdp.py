@@ -347,8 +347,8 @@ class Agent(eqx.Module):
     def cut(self, state: Any) -> Any:
         """The state after all current episodes were cut off from outside (default: ``state``).
 
-        Called where a run is resumed whose environments cannot be: the last steps so far lead to no
-        other, like steps at which an episode is truncated.
+        Called when a run goes on whose environments could not be restored. Nothing follows the
+        latest steps, as if their episodes had been truncated.
         """
         return state
 

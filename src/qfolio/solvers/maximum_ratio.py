@@ -92,7 +92,7 @@ def _interior_point(mu: Floats, sigma: Floats, cap: float, tol: float) -> Floats
         right = target / y + room(pushed) - slope
         step = solve(system, right)
         if not np.isfinite(step).all() and np.isfinite(system).all():
-            step = np.linalg.lstsq(system, right, rcond=None)[0]  # assets that are alike: of many
+            step = np.linalg.lstsq(system, right, rcond=None)[0]  # not unique if assets are alike
         step_s = room(step)
         if not np.isfinite(step).all():
             break

@@ -287,7 +287,7 @@ def _gradients(
 
 
 def _fewer(rules: Rules, wanted: Weights, held: Weights) -> Limits:
-    """Limits that keep all but the largest weights of the order without them at 0.
+    """Limits that keep at 0 all but the largest weights of an order of any number of holdings.
 
     If these need more turnover than there may be, the largest with what is held.
     """

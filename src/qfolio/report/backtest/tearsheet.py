@@ -91,10 +91,10 @@ def _groups(
     def row(name: str, key: str, form: str) -> tuple[str, list[str]]:
         return name, [_written(each[key], form) for each in found]
 
-    def several(most: float, *of: tuple[str, str, str]) -> list[tuple[str, list[str]]]:
-        return [row(*each) for each in of if per_year > most]
+    def rows(shown: bool, *of: tuple[str, str, str]) -> list[tuple[str, list[str]]]:
+        return [row(*each) for each in of if shown]
 
-    monthly, yearly = partial(several, 13), partial(several, 1)
+    monthly, yearly = partial(rows, per_year > 13), partial(rows, per_year > 1)
 
     return [
         (
