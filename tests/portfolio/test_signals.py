@@ -162,25 +162,26 @@ def test_scales_by_hand():
         [[1.0, 3.0, 2.0, np.nan], [5.0, 5.0, 9.0, 7.0], [4.0, np.nan, np.nan, np.nan]]
     )
     of = lambda scale: signals.compute([Level()], values, scale)[..., 0]  # noqa: E731
-    ranks = np.array([[-1, 1, 0, 0], [-2 / 3, -2 / 3, 1, 1 / 3], [0, 0, 0, 0]])
+    nan = np.nan
+    ranks = np.array([[-1, 1, 0, nan], [-2 / 3, -2 / 3, 1, 1 / 3], [0, nan, nan, nan]])
     np.testing.assert_allclose(of("rank"), ranks)
     unit = 1.5**0.5
-    np.testing.assert_allclose(of("z-score")[0], [-unit, unit, 0.0, 0.0])
-    np.testing.assert_allclose(of("z-score")[2], 0)
-    np.testing.assert_allclose(of("centered")[0], [-1, 1, 0, 0])
+    np.testing.assert_allclose(of("z-score")[0], [-unit, unit, 0.0, nan])
+    np.testing.assert_allclose(of("z-score")[2], [0, nan, nan, nan])
+    np.testing.assert_allclose(of("centered")[0], [-1, 1, 0, nan])
     np.testing.assert_allclose(of("centered")[1], [-1.5, -1.5, 2.5, 0.5])
-    np.testing.assert_allclose(of("raw")[0], [1, 3, 2, 0])
+    np.testing.assert_allclose(of("raw")[0], [1, 3, 2, nan])
     values[0, 3] = np.inf  # counts as unknown
     for scale in signals.SCALES:
-        assert of(scale)[0, 3] == 0
-    np.testing.assert_allclose(of("z-score")[0], [-unit, unit, 0.0, 0.0])
+        assert np.isnan(of(scale)[0, 3])
+    np.testing.assert_allclose(of("z-score")[0], [-unit, unit, 0.0, nan])
 
 
 def test_drift_keeps_its_scale():
     found = signals.compute(signals.parse("drift:8-2"), prices(), "rank")
     wanted = signals.compute(signals.parse("drift:8-2"), prices(), "centered")
     np.testing.assert_array_equal(found, wanted)
-    assert abs(found[20:]).max() > 1
+    assert np.nanmax(abs(found[20:])) > 1
 
 
 def test_what_all_assets_share_has_no_rank():
@@ -283,13 +284,33 @@ def test_a_portfolio_observes_them():
     np.testing.assert_allclose(task.extra, ranks, rtol=1e-6)
     np.testing.assert_array_equal(
         Portfolio.of(table(15), horizon=5, signals=text, window=2).extra, task.extra[:15]
-    )  # unknown at first, and so 0
-    assert not task.extra[:5].any()
+    )
+    assert np.isnan(task.extra[:5]).all()
+    assert not task.features(jnp.array(4))[..., 1:].any()  # unknown, and so the mean
     again = on_table(task, table(50))
     np.testing.assert_array_equal(again.extra, task.extra[:50])
     np.testing.assert_array_equal(again.scale, task.scale)
     with pytest.raises(QfolioError, match="signal_scale is 'log'"):
         Portfolio.of(table(), window=2, horizon=10, signals=text, signal_scale="log")
+
+
+def test_the_scale_of_what_is_observed_is_that_of_known_rows():
+    """Unknown rows that counted as 0 made the scale of a volatility's logarithm 4 times as large."""
+    text = "market-volatility:20,momentum:20"
+    task = Portfolio.of(table(), window=2, horizon=10, signals=text)
+    known = np.asarray(task.extra[21:])
+    np.testing.assert_array_equal(np.isnan(task.extra).any((1, 2)), np.arange(60) < 20)
+    np.testing.assert_allclose(task.center[1:], np.nanmean(task.extra, (0, 1)), rtol=1e-5)
+    np.testing.assert_allclose(task.scale[1:], np.nanstd(task.extra, (0, 1)), rtol=1e-5)
+    assert abs(task.center[1]) > 5 * task.scale[1]
+    everywhere = jnp.concatenate([task.features(jnp.array(row))[:, -1:] for row in range(20, 60)], 1)
+    np.testing.assert_allclose(everywhere[..., 1:].mean((0, 1)), 0, atol=1e-4)
+    np.testing.assert_allclose(everywhere[..., 1:].std((0, 1)), 1, atol=1e-4)
+    later = task.part(30, 59)
+    np.testing.assert_allclose(later.scale[1:], known[10:].std((0, 1)), rtol=1e-5)
+    nowhere = Portfolio.of(table(15), window=2, horizon=5, signals=text)
+    np.testing.assert_array_equal(nowhere.center[1:], 0)
+    np.testing.assert_array_equal(nowhere.scale[1:], 1)
 
 
 def test_a_column_of_the_table_is_ranked_like_a_signal():

@@ -7,6 +7,7 @@ and earns the return from there to the next row. No observation at t depends on 
 """
 
 import dataclasses
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -58,7 +59,7 @@ class Portfolio(Market):
     """
 
     log_relatives: Float[Array, "row asset"]  # log return from the row before; 0 if unknown
-    extra: Float[Array, "row asset feature"]  # the table's features, then the signals
+    extra: Float[Array, "row asset feature"]  # the features, then signals; NaN if unknown
     anchors: Float[Array, "anchored asset"]  # weights of the anchor; no rows without one
     limits: Float[Array, " asset"]  # largest weight of each asset; 0 where it cannot be traded
     center: Float[Array, " channel"]  # subtracted from each observed channel; from the part's rows
@@ -129,10 +130,7 @@ class Portfolio(Market):
         )
 
     def on(self, prices: Prices) -> "Portfolio":
-        """The same task on another table, otherwise unchanged.
-
-        Signals are 0 where they are not yet known.
-        """
+        """The same task on another table, otherwise unchanged."""
         year = prices.periods_per_year
         chosen = signals.parse(self.signals, year)
         logs = np.zeros(prices.values.shape)
@@ -141,7 +139,7 @@ class Portfolio(Market):
         computed = signals.compute(
             chosen, prices.known, self.signal_scale, columns, prices.tradable
         )
-        extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
+        extra = np.concatenate([prices.features, computed], -1)
         followed = logs[:0]
         if self.anchor:
             can = buyable(self.mandate) if self.mandate else None
@@ -231,7 +229,8 @@ class Portfolio(Market):
         )[:, usable]
         if self.tradable is not None and not there[:, usable].all():
             channels = channels[there[:, usable]][:, None]
-        center, scale = channels.mean((0, 1)), channels.std((0, 1))
+        with warnings.catch_warnings(action="ignore"):  # of channels that are unknown in all rows
+            center, scale = np.nanmean(channels, (0, 1)), np.nanstd(channels, (0, 1))
         center[0] = 0.0  # returns keep their sign, which is informative
         limits = np.where(usable, self.max_weight, 0.0)
         allowed = _allowed(self.mandate, usable, self.max_weight)
@@ -242,7 +241,7 @@ class Portfolio(Market):
             self,
             (
                 jnp.asarray(limits, jnp.float32),
-                jnp.asarray(center, jnp.float32),
+                jnp.asarray(np.nan_to_num(center), jnp.float32),
                 jnp.asarray(np.where(scale > 0, scale, 1.0), jnp.float32),
                 jnp.array(first + self.window, jnp.int32),
                 jnp.array(last - self.lag - 1, jnp.int32),
@@ -407,12 +406,19 @@ class Portfolio(Market):
         others = lax.dynamic_slice_in_dim(self.extra, start, self.window)
         # Scaled and transposed before they are joined: an agent that reads only signals then
         # computes only them, and XLA copies nothing to leave the returns out.
+        returns = self.scaled(returns[..., None], slice(1))
+        others = self.scaled(others, slice(1, None))
+        return jnp.concatenate([jnp.swapaxes(returns, 0, 1), jnp.swapaxes(others, 0, 1)], -1)
+
+    def scaled(
+        self, values: Float[Array, "*shape part"], which: slice = slice(None)
+    ) -> Float[Array, "*shape part"]:
+        """Channels, or a part of them, as agents observe them: 0, the mean, where unknown."""
         # Multiplied, because XLA divides or multiplies by the reciprocal, depending on how many
         # folds share a program, and these round differently.
         factor = 1 / self.scale
-        returns = (returns - self.center[0]) * factor[0]
-        others = (others - self.center[1:]) * factor[1:]
-        return jnp.concatenate([returns.T[..., None], jnp.swapaxes(others, 0, 1)], -1)
+        moved = (values - self.center[which]) * factor[which]
+        return jnp.where(jnp.isnan(moved), 0.0, moved)
 
     def anchor_weights(self, market: Row) -> Float[Array, " asset"] | None:
         """The anchor's weights; those of assets that cannot be traded go to the others.
@@ -435,7 +441,7 @@ class Portfolio(Market):
         return len(signals.parse(self.signals))
 
     def signalled(self, market: Row) -> Signalled | None:
-        """The anchor (equal weights, if there is none) and the signals of a row, unscaled."""
+        """The anchor (equal weights if there is none) and unscaled signals, 0 where unknown."""
         if not self.tilting:
             return None
         anchor = self.anchor_weights(market)
@@ -444,7 +450,7 @@ class Portfolio(Market):
             open_to = limits > 0
             anchor = jnp.minimum(open_to / jnp.maximum(open_to.sum(), 1), limits)
         others = lax.dynamic_index_in_dim(self.extra, market, keepdims=False)
-        return Signalled(anchor, others[:, others.shape[1] - self.tilting :])
+        return Signalled(anchor, jnp.nan_to_num(others[:, others.shape[1] - self.tilting :]))
 
     @property
     def moves(self) -> Float[Array, ""]:

@@ -27,10 +27,10 @@ def compute(
     columns: Mapping[str, Floats] | None = None,
     tradable: Bools | None = None,
 ) -> Floats:
-    """Signals of shape (row, asset, signal), 0 where one is unknown or repeats an earlier one.
+    """Signals of shape (row, asset, signal), NaN where unknown; 0 if one repeats an earlier one.
 
     prices, columns: of shape (row, asset), NaN where unknown. tradable: which assets are compared
-    at each row, likewise (default: all); the others' signals are 0, except those that all share.
+    at each row, likewise (default: all); the others' are unknown, except those that all share.
 
     Raises QfolioError if the scale or a column is unknown, or if a signal has the wrong shape or
     looks ahead.
@@ -133,7 +133,8 @@ def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
 
         ranks = pd.DataFrame(np.round(values / _unit(values))).rank(axis=1).to_numpy()
         count = (~np.isnan(values)).sum(1, keepdims=True)
-        values = np.where(count > 1, 2 * (ranks - 1) / np.maximum(count - 1, 1) - 1, 0)
+        ranked = 2 * (ranks - 1) / np.maximum(count - 1, 1) - 1
+        return np.where(count > 1, ranked, 0 * values)  # one alone has no rank
     elif not shared and scale in ("z-score", "centered"):
         known, unit = ~np.isnan(values), _unit(values)
         count = np.maximum(known.sum(1, keepdims=True), 1)
@@ -141,7 +142,7 @@ def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
         if scale == "z-score":
             spread = np.sqrt(np.nansum(values**2, 1, keepdims=True) / count)
             values = np.clip(values / np.where(spread > unit, spread, np.inf), -3, 3)
-    return np.nan_to_num(values)
+    return values
 
 
 def _unit(values: Floats) -> Floats:

@@ -18,8 +18,8 @@ from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
 from qfolio.portfolio.backtest.attribution.importance import importance, of_seeds
 from qfolio.portfolio.backtest.attribution.replays import (
     channel_names,
-    channels,
     open_to,
+    seen_in_test,
     shared_channels,
 )
 from qfolio.portfolio.backtest.attribution.slices import slices
@@ -107,7 +107,7 @@ def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> 
     if len(stretches) == 1:
         fitted[days // 2 :] = False
     anchor = np.asarray(task.anchors)[begin:end] if task.anchor else np.zeros_like(tradable)
-    seen = np.asarray(channels(task))[begin:end]
+    seen = seen_in_test(stretches)
     given = ~np.isnan(decisions[:, 0])  # there are no orders between a calendar's decisions
     ordered, anchor, seen = decisions[given, 1:], anchor[given], seen[given]
     return distil(ordered, anchor, seen, names, tradable[given], fitted[given])

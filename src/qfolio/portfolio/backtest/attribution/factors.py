@@ -111,7 +111,7 @@ def factor_returns(
     market = moves.sum(1) / np.maximum(held.sum(1), 1)
     found = {"market": market[days] - cash}
     for name, signal in _signals(periods_per_year).items():
-        ranks = compute([signal], values, tradable=there)[..., 0]
+        ranks = np.nan_to_num(compute([signal], values, tradable=there)[..., 0])
         weights = _long_short(-ranks if name == "low volatility" else ranks)
         found[name] = (weights[:-1] * moves[1:]).sum(1)[days.start - 1 : days.stop - 1]
     active = np.where(held, moves - market[:, None], 0)

@@ -31,7 +31,7 @@ AT_ONCE = 16
 class Observed(Portfolio):
     """A portfolio whose observed channels are given, with those of row ``begin`` first."""
 
-    observed: Float[Array, "seen asset channel"] = eqx.field(kw_only=True)
+    observed: Float[Array, "seen asset channel"] = eqx.field(kw_only=True)  # NaN where unknown
     begin: Int[Array, ""] = eqx.field(kw_only=True)
 
     @staticmethod
@@ -41,14 +41,15 @@ class Observed(Portfolio):
 
     def features(self, market: Int[Array, ""]) -> Float[Array, "asset time channel"]:
         start = market - self.window + 1 - self.begin
-        return jnp.swapaxes(lax.dynamic_slice_in_dim(self.observed, start, self.window), 0, 1)
+        window = lax.dynamic_slice_in_dim(self.observed, start, self.window)
+        return jnp.swapaxes(self.scaled(window), 0, 1)
 
     def signalled(self, market: Int[Array, ""]) -> Signalled | None:
         found = super().signalled(market)
         if found is None:
             return None
-        latest = self.features(market)[:, -1] * self.scale + self.center
-        return found._replace(signals=latest[:, latest.shape[1] - self.tilting :])
+        latest = lax.dynamic_index_in_dim(self.observed, market - self.begin, keepdims=False)
+        return found._replace(signals=jnp.nan_to_num(latest[:, latest.shape[1] - self.tilting :]))
 
 
 class Shuffle(NamedTuple):
@@ -100,8 +101,8 @@ class Shuffles(NamedTuple):
         own = others = channels(task)
         shared = shared_channels(stretches)
         if task.tradable is not None:
-            # Where an asset is not tradable its signals are 0, those that all share as well. It
-            # may be tradable in the row that sees them, so it gets another's.
+            # Where an asset is not tradable its channels are unknown. It may be tradable in the row
+            # that sees them, so it gets those that all share from another.
             common = own[jnp.arange(len(own)), task.tradable.argmax(1)]
             others = jnp.where(jnp.asarray(shared), common[:, None], own)
         return Shuffles(begin, rows, shown, shared, own, others)
@@ -120,8 +121,14 @@ def channel_names(task: Portfolio, feature_names: Sequence[str]) -> list[str]:
 
 
 def channels(task: Portfolio) -> Float[Array, "row asset channel"]:
-    """All channels on all rows of the table, before scaling."""
+    """All channels on all rows of the table, before scaling; NaN where unknown."""
     return jnp.concatenate([task.log_relatives[..., None], task.extra], -1)
+
+
+def seen_in_test(stretches: Sequence[Stretch]) -> np.ndarray:
+    """All channels on the days of the test, before scaling; 0 where unknown."""
+    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
+    return np.nan_to_num(np.asarray(channels(stretches[0].task))[begin:end])
 
 
 def open_to(stretches: Sequence[Stretch]) -> np.ndarray:
@@ -136,8 +143,7 @@ def open_to(stretches: Sequence[Stretch]) -> np.ndarray:
 
 def shared_channels(stretches: Sequence[Stretch]) -> np.ndarray:
     """Whether a channel is the same for all assets that may be bought on the days of the test."""
-    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
-    shown, there = np.asarray(channels(stretches[0].task))[begin:end], open_to(stretches)
+    shown, there = seen_in_test(stretches), open_to(stretches)
     least = (np.where(there, each, np.inf).min(1) for each in np.moveaxis(shown, -1, 0))
     most = (np.where(there, each, -np.inf).max(1) for each in np.moveaxis(shown, -1, 0))
     return np.array([bool((x <= y).all()) for x, y in zip(most, least, strict=True)])
@@ -204,8 +210,7 @@ def _paths(
         held, mask, row_draw, asset_draw = given
         seen = jnp.take_along_axis(others[rows[row_draw]], assets[asset_draw][..., None], 1)
         mixed = jnp.where(mask > 0, seen, own[rows[0]])
-        observed = (mixed - task.center) / task.scale
-        blind = Observed.given(task, observed, first - task.window + 1)
+        blind = Observed.given(task, mixed, first - task.window + 1)
         start = jax.tree.map(lambda x: x[None], held)
         found = paths(blind, agent, members, first, start, count)
         _, targets, after = jax.tree.map(lambda x: x[0], found)

@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from qfolio.core.mdp import Agent
-from qfolio.portfolio.backtest.attribution.replays import Observed, channels, open_to
+from qfolio.portfolio.backtest.attribution.replays import Observed, open_to, seen_in_test
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.task import Portfolio
 
@@ -83,8 +83,7 @@ def slices(
     order = np.argsort(-np.where(tradable, typical[1:], -1.0), kind="stable") + 1
     asset = int(order[0])
     partner = int(order[1]) if tradable.sum() > 1 else 0
-    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
-    seen = np.asarray(channels(stretches[0].task))[begin:end]
+    seen = seen_in_test(stretches)
     grids = []
     for channel in range(len(names)):
         low, high = np.quantile(seen[there, channel], (TAIL, 1 - TAIL)).tolist()
@@ -130,7 +129,8 @@ def answer(
 ) -> Float[Array, " entry"]:
     """The target weights at a row with the given features, the mean of all members."""
     asked = eqx.tree_at(lambda t: t.decides, task, jnp.ones_like(task.decides))  # on any day
-    seen = Observed.given(asked, jnp.swapaxes(features, 0, 1), row - task.window + 1)
+    observed = jnp.swapaxes(features * task.scale + task.center, 0, 1)
+    seen = Observed.given(asked, observed, row - task.window + 1)
     holding = seen.hold(held)
     view = jax.tree.map(lambda x: x[None], seen.view(row, holding))
 
