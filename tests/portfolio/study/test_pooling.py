@@ -187,6 +187,15 @@ def test_shocks_that_arrive_a_day_later_are_shared():
     assert np.mean(others) < 0.1
 
 
+def test_a_few_common_months_say_nothing():
+    """Of two tables of years, only what both have in common counts."""
+    x = np.random.default_rng(5).standard_normal(1901)
+    dates = text(weekdays(1900, "2001-01-01").astype("M8[D]"))
+    early, late, shared = x[1:1001], x[900:1900], 100
+    daily = np.corrcoef(early[-shared:], late[:shared])[0, 1] * shared / 1000
+    assert correlations([dates[:1000], dates[900:]], [early, late])[0, 1] == max(0, daily)
+
+
 def test_one_market_with_two_frequencies_counts_once():
     """Were its rows independent, its z would be √2 times as large."""
     rng = np.random.default_rng(7)

@@ -33,7 +33,7 @@ RESAMPLES = 2000
 """Number of histories that the hierarchical bootstrap draws."""
 
 MONTHS = 24
-"""Months of two tables from which on the sums of months say how much they share."""
+"""Common months of two tables from which on their sums say how much the tables share."""
 
 SPANS = ((1.5, "D"), (11.0, "W"), (46.0, "M"), (137.0, "3M"), (math.inf, "Y"))
 """Spans of the calendar, and the most days between the rows of a table that they suit."""
@@ -288,8 +288,8 @@ def correlations(days: Sequence[Sequence[str]], active: Sequence[Floats]) -> Flo
     month its first or its last day. So the days are those of the calendar for daily and intraday
     rows only; otherwise they are its weeks, months, quarters or years, whichever are as long as the
     rows of both tables, with the sums of the differences. Shocks also arrive a day later in another
-    part of the world, and in stale prices, so that two years or more are also compared by months,
-    and the larger correlation counts.
+    part of the world, and in stale prices, so that two common years or more are also compared by
+    months, and the larger correlation counts.
 
     Args:
         days: Days of each table, with a time of day if there are several rows a day.
@@ -303,7 +303,8 @@ def correlations(days: Sequence[Sequence[str]], active: Sequence[Floats]) -> Flo
         for j in range(i):
             longest = max(lengths[i], lengths[j])
             units = [next(unit for most, unit in SPANS if longest <= most)]
-            if min(len(sums(table, "M")[0]) for table in (i, j)) >= MONTHS and units[0] in "DW":
+            common = np.intersect1d(sums(i, "M")[0], sums(j, "M")[0])
+            if len(common) >= MONTHS and units[0] in "DW":
                 units.append("M")
             found = max(_shared(sums(i, unit), sums(j, unit)) for unit in units)
             shared[i, j] = shared[j, i] = found
