@@ -639,6 +639,7 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
         ("date,A,B,C\nsoon,1,1,1\n", "in row 2"),
         ("name,from,to\nA,,\n", "name it asset|do not name"),
         ("asset,from,to\nA,,\nB,,\nC,never,\n", "'from' in row 4"),
+        ("asset,from,to\nA,,\nB,,\nC,2024-01-09,2024-01-02\n", "row 4 goes from 2024-01-09 to"),
         ("asset,from,until\nA,,\nB,,\nC,,\n", "'asset', but not both from and to; .* 'until'"),
     ],
 )

@@ -8,7 +8,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.cells import is_missing, label, numbers
 from qfolio.portfolio.prices.dates import read_dates
-from qfolio.portfolio.prices.findings import listing
+from qfolio.portfolio.prices.findings import day, listing
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.records import in_order
@@ -81,6 +81,12 @@ def _of_spans(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.nd
     labels = [label(cell) for cell in table.columns[place].tolist()]
     _require_all(labels, assets)
     begin, end = (_dates(table, names.index(name)) for name in SPANS)
+    if (swapped := end < begin.astype("datetime64[D]")).any():
+        i = int(swapped.argmax())
+        raise QfolioError(
+            f"row {table.first_row + i} goes from {day(begin[i])} to {day(end[i])}, which is "
+            "earlier; exchange the two, or correct them."
+        )
     members = np.zeros((len(dates), len(assets)), bool)
     for i, name in enumerate(labels):
         if name in assets:
