@@ -85,6 +85,18 @@ def test_returns_that_cannot_be(cell: float, unit: str, message: str):
     assert message in str(raised.value)
 
 
+def test_an_asset_that_lost_everything_stays_in_the_table():
+    """To drop it would be survivorship."""
+    lost, rates = prices(), prices().pct_change()
+    lost.iloc[7:, 1], rates.iloc[7, 1] = 0.0, -1.0
+    for table, unit in ((lost, None), (rates, "fraction")):
+        with pytest.raises(QfolioError, match="empty its cells from there on and choose ended='c"):
+            load(table, returns=unit)
+        table.iloc[7:, 1] = np.nan
+        found = load(table, returns=unit, ended="cash-out", delisting_haircut=1)
+        assert found.values[7, 1] < 1e-6
+
+
 def test_a_unit_that_is_unlikely():
     rates = prices().pct_change()
     assert findings(rates, "warning", returns="fraction") == []

@@ -8,7 +8,7 @@ from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.frequency import every_day, spacing
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Block, Grid, report_cells
-from qfolio.portfolio.prices.returns import look_like_returns
+from qfolio.portfolio.prices.returns import RUIN, look_like_returns
 
 FEWEST_ROWS, FEW_ROWS = 3, 60
 
@@ -56,8 +56,7 @@ def check_cells(grid: Grid, findings: Findings) -> None:
         return
     report_cells(
         grid, grid.prices, values == 0, "is zero",
-        "Leave the cell empty where there was no trade; a worthless asset must be dropped.",
-        findings,
+        f"Leave the cell empty where there was no trade. {RUIN}", findings,
     )  # fmt: skip
     report_cells(
         grid, grid.prices, np.isfinite(values) & (values < 0), "is negative",

@@ -11,6 +11,10 @@ START = 100.0
 UNITS = {"percent": 0.01, "fraction": 1.0}
 USUAL = {"percent": (0.02, np.inf), "fraction": (0.0, 0.2)}
 """The range of a usual return, in its unit: from a bar of minutes to a year."""
+RUIN = (
+    "Keep an asset that lost everything: empty its cells from there on and choose ended='cash-out' "
+    "with a delisting_haircut (--ended, --delisting-haircut)."
+)
 SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
 
 
@@ -29,9 +33,7 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
         report_cells(grid, block, np.isinf(rates), "is infinite", "Correct the cell.", findings)
         report_cells(
             grid, block, known & (rates <= -1), "is −100% or less",
-            "Check the unit, returns='percent' or 'fraction' (--returns); an asset that lost "
-            "everything must be dropped.",
-            findings,
+            f"Check the unit, returns='percent' or 'fraction' (--returns). {RUIN}", findings,
         )  # fmt: skip
         growth = np.cumprod(1 + np.where(known & (rates > -1), rates, 0.0), axis=0)
         present = ~np.isnan(rates) | block.wrong
