@@ -623,7 +623,13 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
         ],
         -1,
     )
-    for source in (rows, tmp_path / "rows.csv", tmp_path / "spans.csv"):
+    numbered = rows.reset_index()
+    numbered.to_csv(tmp_path / "numbered.csv")
+    for source in (
+        rows,
+        numbered.set_axis([7, 9]),  # numbers that are no dates
+        *(tmp_path / name for name in ("rows.csv", "numbered.csv", "spans.csv")),
+    ):
         np.testing.assert_array_equal(load(frame, members=source).members, wanted)
     for text, said in (("", "has no rows"), ("2024-01-03,1,1,1\n" * 2, "2024-01-03 appears twice")):
         (tmp_path / "wrong.csv").write_text("date,A,B,C\n" + text)

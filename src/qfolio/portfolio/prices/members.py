@@ -12,7 +12,7 @@ from qfolio.portfolio.prices.findings import day, listing
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.records import in_order
-from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, plain
+from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, DATE_NAMES, plain
 
 SPANS = ("from", "to")
 
@@ -30,7 +30,9 @@ def membership(source: Any, dates: np.ndarray, assets: tuple[str, ...]) -> np.nd
     Raises:
         QfolioError: The source cannot be read, or does not say when each asset is a member.
     """
-    table = read(source, lambda names: {0, *range(len(names))} if _spans(names) else {0})
+    table = read(
+        source, lambda names: set(range(len(names))) if _spans(names) else {_date_column(names)}
+    )
     try:
         _require_kind(table.names)
         found = _of_spans if _spans(table.names) else _of_rows
@@ -53,11 +55,18 @@ def _require_kind(names: tuple[str, ...]) -> None:
         )
 
 
+def _date_column(names: tuple[str, ...]) -> int:
+    """The first, unless it has no name, such as row numbers, and another is called date."""
+    dated = (j for j, name in enumerate(names) if plain(name) in DATE_NAMES)
+    return 0 if names[0] else next(dated, 0)
+
+
 def _of_rows(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.ndarray:
-    _require_all(table.names[1:], assets)
-    since = _dates(table, 0)
+    when = _date_column(table.names)
+    _require_all([name for j, name in enumerate(table.names) if j != when], assets)
+    since = _dates(table, when)
     if np.isnat(since).any():
-        raise QfolioError("a row has no date; the first column must hold the dates.")
+        raise QfolioError("a row has no date; give each row one.")
     if not len(since):
         raise QfolioError("the table has no rows.")
     order = in_order(since, table)
