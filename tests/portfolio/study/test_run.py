@@ -141,6 +141,9 @@ def test_looks_are_counted_and_inherited(finished, tmp_path):
     assert later.config.tables["new"].trials == 3
     assert later.backtest("again").config.trials == 5
     assert len(later.config.earlier) == 4  # each once
+    last = create(tmp_path / "last", tables, trials=1, after=[finished.folder, later.folder])
+    assert last.config.tables["again"].trials == 1 + 3 + 2  # those that the second was told of, too
+    assert last.config.tables["new"].trials == 1 + 3
 
 
 def _untested(pools):

@@ -108,7 +108,8 @@ class Study:
                 first of each make the main variant.
             train, test: Lengths such as "5y" or "500d" (d counts rows).
             trials: Earlier looks at each of the tables.
-            after: Folders of earlier studies; their looks at the same tables are counted, too.
+            after: Folders of earlier studies; their looks at the same tables are counted, too, and
+                those that they were told of by ``trials``.
             command: The command that started it, for the reports.
             out: A new or empty folder.
             options: Further arguments of ``Backtest.create``: expanding, seeds, baselines, ….
@@ -134,7 +135,8 @@ class Study:
         _require_plan(tables, variants)
         earlier = list(dict.fromkeys(look for folder in after for look in looks_of(folder)))
         looks = {
-            name: int(trials) + _count(earlier, table.digest) for name, table in tables.items()
+            name: int(trials) + _told(after, table.digest) + _count(earlier, table.digest)
+            for name, table in tables.items()
         }
         left_out = {}
         with new_folder(place) as folder:
@@ -408,6 +410,21 @@ def _table_config(prices: Prices, trials: int) -> TableConfig:
 
 def _count(looks: Sequence[Look], digest: str) -> int:
     return sum(len(look.agents) for look in looks if look.digest == digest)
+
+
+def _told(folders: Sequence[Path | str], digest: str) -> int:
+    """The looks at a table that earlier studies were told of by ``trials``.
+
+    Several may have been told of the same ones, so the largest number counts.
+    """
+    studies = [StudyFolder(Path(folder)).read() for folder in folders]
+    told = (
+        table.trials - _count(study.earlier, digest)
+        for study in studies
+        for table in study.tables.values()
+        if table.digest == digest
+    )
+    return max(told, default=0)
 
 
 def _charged(costs: Sequence[float], options: Mapping[str, Any]) -> list[float]:
