@@ -47,10 +47,10 @@ class Drift(Signal):
 
 
 class Volatility(Signal):
-    """Log standard deviation of log returns (Ang, Hodrick, Xing & Zhang 2006)."""
+    """Log standard deviation of log returns, of at least two (Ang, Hodrick, Xing & Zhang 2006)."""
 
     def measure(self, prices: Floats, rows: int) -> Floats:
-        return _log(_deviation(_returns(prices), rows))
+        return _log(_deviation(_returns(prices), max(2, rows)))
 
 
 class VolatilityRatio(Signal):
@@ -149,7 +149,7 @@ class MarketVolatility(Signal):
     shared = True
 
     def measure(self, prices: Floats, rows: int) -> Floats:
-        return _log(_deviation(_market(_returns(prices)), rows))
+        return _log(_deviation(_market(_returns(prices)), max(2, rows)))
 
 
 def _returns(prices: Floats) -> Floats:
