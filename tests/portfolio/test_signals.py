@@ -304,7 +304,9 @@ def test_the_scale_of_what_is_observed_is_that_of_known_rows():
     np.testing.assert_allclose(task.center[1:], np.nanmean(task.extra, (0, 1)), rtol=1e-5)
     np.testing.assert_allclose(task.scale[1:], np.nanstd(task.extra, (0, 1)), rtol=1e-5)
     assert abs(task.center[1]) > 5 * task.scale[1]
-    everywhere = jnp.concatenate([task.features(jnp.array(row))[:, -1:] for row in range(20, 60)], 1)
+    everywhere = jnp.concatenate(
+        [task.features(jnp.array(row))[:, -1:] for row in range(20, 60)], 1
+    )
     np.testing.assert_allclose(everywhere[..., 1:].mean((0, 1)), 0, atol=1e-4)
     np.testing.assert_allclose(everywhere[..., 1:].std((0, 1)), 1, atol=1e-4)
     later = task.part(30, 59)
