@@ -296,7 +296,7 @@ def test_a_portfolio_observes_them():
 
 
 def test_the_scale_of_what_is_observed_is_that_of_known_rows():
-    """Unknown rows that counted as 0 made the scale of a volatility's logarithm 4 times as large."""
+    """Unknown rows that counted as 0 made the scale of a log volatility 4 times as large."""
     text = "market-volatility:20,momentum:20"
     task = Portfolio.of(table(), window=2, horizon=10, signals=text)
     known = np.asarray(task.extra[21:])
