@@ -625,10 +625,12 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
     )
     numbered = rows.reset_index()
     numbered.to_csv(tmp_path / "numbered.csv")
+    rows.astype(bool).to_csv(tmp_path / "truth.csv")
     for source in (
         rows,
         numbered.set_axis([7, 9]),  # numbers that are no dates
-        *(tmp_path / name for name in ("rows.csv", "numbered.csv", "spans.csv")),
+        rows.astype(bool),
+        *(tmp_path / name for name in ("rows.csv", "numbered.csv", "truth.csv", "spans.csv")),
     ):
         np.testing.assert_array_equal(load(frame, members=source).members, wanted)
     for text, said in (("", "has no rows"), ("2024-01-03,1,1,1\n" * 2, "2024-01-03 appears twice")):

@@ -15,6 +15,7 @@ from qfolio.portfolio.prices.records import in_order
 from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, DATE_NAMES, plain
 
 SPANS = ("from", "to")
+TRUTH = {"true": 1, "false": 0}
 
 
 def membership(source: Any, dates: np.ndarray, assets: tuple[str, ...]) -> np.ndarray:
@@ -74,7 +75,8 @@ def _of_rows(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.nda
     known = np.empty((len(since), len(assets)), bool)
     for j, name in enumerate(assets):
         column = table.names.index(name)
-        values, wrong = numbers(table.columns[column])
+        cells = [TRUTH.get(str(cell).strip().lower(), cell) for cell in table.columns[column]]
+        values, wrong = numbers(np.array(cells, object))
         if (bad := wrong | ~np.isin(values, (0, 1))).any():
             row = table.first_row + int(bad.argmax())
             raise QfolioError(f"{quote(name)} is neither 0 nor 1 in row {row}; write one of them.")
