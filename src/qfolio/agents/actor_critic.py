@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio.core.fields import constant, number, require, require_counts, sizes, static
+from qfolio.core.fields import Group, constant, number, require, require_counts, sizes, static
 from qfolio.core.mdp import Actions, Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.exploration import OrnsteinUhlenbeck, uniform
@@ -170,6 +170,11 @@ class ActorCritic(Agent, Generic[L]):
     value_rescaling: bool = static(False)  # critics learn roots of values: small ones weigh more
     clip_bootstrap: bool = static(True)  # clips next values to what rewards so far allow
 
+    _replay = Group(ReplayConfig)
+    _networks = Group(NetworkConfig)
+    _normalization = Group(NormalizationConfig)
+    _schedule = Group(CosineSchedule)
+
     def __check_init__(self) -> None:
         self._replay.check()
         self._networks.check()
@@ -180,26 +185,6 @@ class ActorCritic(Agent, Generic[L]):
         require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
         require(self, "discount tau noise_theta", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-
-    @property
-    def _replay(self) -> ReplayConfig:
-        return ReplayConfig(
-            self.num_envs, self.batch_size, self.n_steps, self.replay_capacity, self.learning_starts
-        )
-
-    @property
-    def _networks(self) -> NetworkConfig:
-        return NetworkConfig(self.network, self.hidden, self.input_gain)
-
-    @property
-    def _normalization(self) -> NormalizationConfig:
-        return NormalizationConfig(self.normalize_observations, self.normalize_rewards)
-
-    @property
-    def _schedule(self) -> CosineSchedule:
-        return CosineSchedule(
-            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
-        )
 
     @abc.abstractmethod
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> L:

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from qfolio.agents import hindsight
 from qfolio.agents.hindsight import Move
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import constant, number, require, require_counts, sizes, static
+from qfolio.core.fields import Group, constant, number, require, require_counts, sizes, static
 from qfolio.core.mdp import Agent, Discrete, ExogenousTask, Metrics, Task, Transition
 from qfolio.learning import heads, optimizer
 from qfolio.learning.bootstrapped import Heads, cautious, samples
@@ -119,6 +119,15 @@ class DQN(Agent):
     input_gain: float = number(0.0)  # gain of the first layer on inputs scaled to ±1; 0: unscaled
     value_rescaling: bool = static(False)  # learn roots of values, so that small ones weigh more
 
+    _replay = Group(ReplayConfig)
+    _networks = Group(NetworkConfig)
+    _value_config = Group(ValueConfig)
+    _schedule = Group(CosineSchedule)
+    _optimizer = Group(OptimizerConfig)
+    _importance = Group(ImportanceSchedule)
+    _linear, _decaying = Group(LinearSchedule), Group(EpsilonSchedule)  # of ε
+    _rule = Group(hindsight.Rule)
+
     def __check_init__(self) -> None:
         self._replay.check()
         self._networks.check()
@@ -154,46 +163,14 @@ class DQN(Agent):
             )
 
     @property
-    def _replay(self) -> ReplayConfig:
-        return ReplayConfig(
-            self.num_envs, self.batch_size, self.n_steps, self.replay_capacity,
-            self.learning_starts, self.prioritized,
-        )  # fmt: skip
-
-    @property
-    def _networks(self) -> NetworkConfig:
-        return NetworkConfig(self.network, self.hidden, self.input_gain)
-
-    @property
     def _head(self) -> HeadConfig:
         noise = self.noise_scale if self.noisy else None
         return HeadConfig(self._values.atoms, self.dueling, noise)
 
-    @property
-    def _optimizer(self) -> OptimizerConfig:
-        return OptimizerConfig(self.optimizer, self.rmsprop_decay, self.optimizer_epsilon)
-
-    @property
-    def _schedule(self) -> CosineSchedule:
-        return CosineSchedule(
-            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
-        )
-
     def _epsilon(self, state: DQNState) -> Float[Array, ""]:
-        start, end = self.epsilon_start, self.epsilon_end
         if self.epsilon_steps:
-            return LinearSchedule(start, end, self.epsilon_steps)(1.0 * self.num_envs * state.steps)
-        return EpsilonSchedule(start, end, self.epsilon_decay)(state.episodes)
-
-    @property
-    def _importance(self) -> ImportanceSchedule:
-        return ImportanceSchedule(self.importance_exponent, self.importance_steps)
-
-    @property
-    def _value_config(self) -> ValueConfig:
-        return ValueConfig(
-            self.values, self.atoms, self.v_min, self.v_max, self.huber_delta, self.value_rescaling
-        )
+            return self._linear(1.0 * self.num_envs * state.steps)
+        return self._decaying(state.episodes)
 
     @property
     def _values(self) -> Values:
@@ -378,13 +355,10 @@ class DQN(Agent):
         self, task: Task, online: Weights, target: Weights, moves: Move, key: PRNGKeyArray
     ) -> Losses:
         assert isinstance(task, ExogenousTask)
-        rule = hindsight.Rule(
-            self.discount, self.reward_scale, self.double, self.market_baseline, self.outcomes
-        )
 
         def errors(online: Network, target: Network) -> tuple[Array, Array]:
             q = partial(self._q, online), partial(self._q, target)
-            return hindsight.errors(rule, task, moves, key, *q)
+            return hindsight.errors(self._rule, task, moves, key, *q)
 
         if isinstance(online, Heads) and isinstance(target, Heads):
             error, values = jax.vmap(errors)(online.networks, target.networks)

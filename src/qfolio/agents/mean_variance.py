@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from qfolio.agents.paths import Onlooker
 from qfolio.core import quadratic
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require, require_counts, static
+from qfolio.core.fields import Group, number, require, require_counts, static
 from qfolio.core.market import View
 from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
@@ -129,9 +129,11 @@ class MeanVariance(Onlooker):
     threshold: float = number(2.0)  # t-statistic up to which no returns are expected
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 
+    _evidence = Group(EvidenceConfig)
+
     def __check_init__(self) -> None:
         require_counts(self, "units")
-        EvidenceConfig(self.members, self.blocks, self.threshold, self.memory).check()
+        self._evidence.check()
         require_counts(self, "rollout_length", 2)
         require(self, "head", lambda x: 0 <= x < self.rollout_length, "at least 0 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from qfolio.core.fields import constant, number, require, require_counts, sizes, static
+from qfolio.core.fields import Group, constant, number, require, require_counts, sizes, static
 from qfolio.core.mdp import Actions, Agent, Box, Metrics, Position, Simplex, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
@@ -101,6 +101,11 @@ class OnPolicy(Agent):
     normalize_observations: bool = static(False)  # by their running mean and standard deviation
     normalize_rewards: bool = static(False)  # by the running deviation of discounted returns
 
+    _networks = Group(NetworkConfig)
+    _normalization = Group(NormalizationConfig)
+    _schedule = Group(CosineSchedule)
+    _optimizer = Group(OptimizerConfig)
+
     def __check_init__(self) -> None:
         require_counts(self, "rollout_length")
         require(self, "discount", lambda x: 0 <= x <= 1, "between 0 and 1")
@@ -113,26 +118,6 @@ class OnPolicy(Agent):
         self._optimizer.check()
         self._networks.check()
         self._normalization.check(self.input_gain)
-
-    @property
-    def _networks(self) -> NetworkConfig:
-        return NetworkConfig(
-            self.network, self.hidden, self.input_gain, self.activation, self.initialization
-        )
-
-    @property
-    def _optimizer(self) -> OptimizerConfig:
-        return OptimizerConfig(self.optimizer, self.rmsprop_decay, self.optimizer_epsilon)
-
-    @property
-    def _schedule(self) -> CosineSchedule:
-        return CosineSchedule(
-            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
-        )
-
-    @property
-    def _normalization(self) -> NormalizationConfig:
-        return NormalizationConfig(self.normalize_observations, self.normalize_rewards)
 
     @property
     def rollout_steps(self) -> int:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
+from qfolio.core.fields import Group
 from qfolio.core.market import SEARCHED, View
 from qfolio.core.mdp import Agent, ExogenousTask, Metrics, Position, Task, Transition
 from qfolio.core.training import episode_steps
@@ -45,26 +46,10 @@ class OnPaths(Agent):
 
         @property
         def rollout_length(self) -> int: ...
-
-        @property
-        def learning_rate(self) -> float: ...
-
-        @property
-        def learning_rate_final(self) -> float: ...
-
-        @property
-        def learning_rate_steps(self) -> float: ...
     else:
         rollout_length: eqx.AbstractVar[int]
-        learning_rate: eqx.AbstractVar[float]
-        learning_rate_final: eqx.AbstractVar[float]
-        learning_rate_steps: eqx.AbstractVar[float]
 
-    @property
-    def _schedule(self) -> CosineSchedule:
-        return CosineSchedule(
-            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
-        )
+    _schedule = Group(CosineSchedule)
 
     @property
     def discount(self) -> None:

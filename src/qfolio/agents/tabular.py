@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require, static
+from qfolio.core.fields import Group, number, require, static
 from qfolio.core.mdp import Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning.exploration import EpsilonSchedule, epsilon_greedy
 from qfolio.learning.targets import bootstrap, td_target
@@ -83,16 +83,14 @@ class Tabular(Agent):
 
     count = 1  # of tables
 
+    _epsilon = Group(EpsilonSchedule)
+
     def __check_init__(self) -> None:
         require(self, "num_envs", lambda x: 1 <= x <= 4096, "from 1 to 4096")
         fractions = "discount learning_rate epsilon_start epsilon_end epsilon_decay"
         require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "learning_rate_decay", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "initial_value", lambda x: abs(x) <= 1e30, "from −1e30 to 1e30")
-
-    @property
-    def _epsilon(self) -> EpsilonSchedule:
-        return EpsilonSchedule(self.epsilon_start, self.epsilon_end, self.epsilon_decay)
 
     def init(self, task: Task, key: PRNGKeyArray) -> TableState:
         if task.states is None or not isinstance(task.actions, Discrete):

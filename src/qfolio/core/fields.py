@@ -3,12 +3,14 @@
 import dataclasses
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.settings import SCALARS, converted
+
+T = TypeVar("T")
 
 
 def static(default: Any) -> Any:
@@ -49,6 +51,22 @@ def _field(default: Any, kind: Any = None, *, static: bool = False) -> Any:
 
     field = eqx.field(converter=convert, static=static, default=default)
     return field
+
+
+class Group(Generic[T]):
+    """Some settings of an instance, in a named tuple whose fields have their names.
+
+    A field keeps its default if the instance has no setting of its name.
+    """
+
+    def __init__(self, kind: Callable[..., T]) -> None:
+        self.kind, self.names = kind, tuple(inspect.signature(kind).parameters)
+
+    def __get__(self, instance: Any, owner: Any = None) -> T:
+        if instance is None:
+            raise AttributeError("settings are those of an instance")
+        names = (name for name in self.names if hasattr(instance, name))
+        return self.kind(**{name: getattr(instance, name) for name in names})
 
 
 def require(instance: Any, names: str, holds: Callable[[Any], bool], wanted: str) -> None:
