@@ -19,12 +19,12 @@ import numpy as np
 from qfolio.core.arrays import Floats
 from qfolio.core.statistics import (
     FEWEST_SEEDS,
+    bootstrap_interval,
     holm,
     interquartile_mean,
     probability_of_improvement,
     rank_test,
     regret,
-    stratified_interval,
 )
 
 THRESHOLDS = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
@@ -186,7 +186,7 @@ def _measures(
 
 def _spread(values: Floats) -> dict[str, Any]:
     """Interquartile mean over seeds, and its interval; None for too few seeds."""
-    interval = list(stratified_interval([values])) if len(values) >= FEWEST_SEEDS else None
+    interval = list(bootstrap_interval([values])) if len(values) >= FEWEST_SEEDS else None
     return {"iqm": float(interquartile_mean(values)), "interval": interval}
 
 
@@ -218,7 +218,7 @@ def _pairs(scores: dict[str, Floats], order: Sequence[str], sign: float) -> list
         row: dict[str, Any] = {"first": a, "second": b, "p": p, "told_apart": p <= LEVEL}
         statistics = {"probability": probability_of_improvement, "difference": difference}
         for key, statistic in statistics.items():
-            interval = list(stratified_interval(both, statistic)) if several else None
+            interval = list(bootstrap_interval(both, statistic)) if several else None
             row |= {key: float(statistic(*both)), f"{key}_interval": interval}
         rows.append(row)
     return rows
