@@ -341,22 +341,12 @@ class Policy:
 
     def save(self, folder: Path | str) -> None:
         """Writes the policy into a new or empty folder."""
-        content = policy_folder.Content(
-            self.task,
-            self.agent,
-            self.members,
-            self.assets,
-            self.features,
-            self.learner,
-            self.updates,
-            self.learned,
-        )
-        policy_folder.save(content, self.seeds, self.rows, path_of("folder", folder))
+        policy_folder.save(self, path_of("folder", folder))
 
     @classmethod
     def open(cls, folder: Path | str) -> "Policy":
         """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
-        return cls(*policy_folder.read(path_of("folder", folder)))
+        return cls(**policy_folder.read(path_of("folder", folder)))
 
     def _moved(self, table: Prices) -> Portfolio:
         """The task on all rows of another table, with the scale of the old one."""

@@ -5,9 +5,8 @@ learning.safetensors the whole learning state, for updates.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -23,6 +22,9 @@ from qfolio.core.files import new_folder, read_tree, write_tree
 from qfolio.core.mdp import Agent
 from qfolio.core.registry import build, name_of
 from qfolio.portfolio.task import Portfolio
+
+if TYPE_CHECKING:
+    from qfolio.portfolio.policy import Policy
 
 
 class PolicyConfig(Config, frozen=True):
@@ -44,44 +46,34 @@ class PolicyConfig(Config, frozen=True):
     periods_per_year: float = 0.0  # rows a year of the prices that it learned from; 0: not known
 
 
-class Content(NamedTuple):
-    """What a folder holds: the arguments of ``policy.Policy``."""
-
-    task: Portfolio
-    agent: Agent
-    members: PyTree  # the agents' weights, with a leading seed axis
-    assets: Sequence[str]
-    features: Sequence[str]
-    learner: PyTree  # the agents' whole states, likewise; None if they cannot go on learning
-    updates: int
-    learned: np.datetime64
-
-
-def save(content: Content, seeds: int, rows: int, folder: Path) -> None:
-    """Writes a policy into a new or empty folder; rows: those that it was trained on."""
+def save(policy: "Policy", folder: Path) -> None:
+    """Writes a policy into a new or empty folder."""
     config = PolicyConfig(
-        agent=name_of(content.agent),
-        settings=settings.describe(content.agent),
-        task=settings.describe(content.task),
-        assets=list(content.assets),
-        features=list(content.features),
-        seeds=seeds,
-        rows=rows,
-        updates=content.updates,
-        learned=str(content.learned),
-        learns=content.learner is not None,
-        periods_per_year=float(content.task.year),
+        agent=name_of(policy.agent),
+        settings=settings.describe(policy.agent),
+        task=settings.describe(policy.task),
+        assets=list(policy.assets),
+        features=list(policy.features),
+        seeds=policy.seeds,
+        rows=policy.rows,
+        updates=policy.updates,
+        learned=str(policy.learned),
+        learns=policy.learner is not None,
+        periods_per_year=float(policy.task.year),
     )
     with new_folder(folder, None) as place:
         write_config(place / "policy.json", config)
-        kept = jax.tree.map(np.asarray, _kept(content.task, content.members))
+        kept = jax.tree.map(np.asarray, _kept(policy.task, policy.members))
         write_tree(place / "policy.safetensors", kept)
-        if content.learner is not None:
-            write_tree(place / "learning.safetensors", content.learner)
+        if policy.learner is not None:
+            write_tree(place / "learning.safetensors", policy.learner)
 
 
-def read(folder: Path) -> Content:
-    """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
+def read(folder: Path) -> dict[str, Any]:
+    """The arguments of the ``Policy`` that was saved.
+
+    Raises QfolioError if the folder holds no policy.
+    """
     path = folder / "policy.json"
     config = read_config(path, PolicyConfig)
     try:
@@ -98,9 +90,16 @@ def read(folder: Path) -> Content:
     members = kept.pop("members")
     task = dataclasses.replace(task, **jax.tree.map(jnp.asarray, kept))
     learner = read_tree(path.with_name("learning.safetensors"), state) if config.learns else None
-    return Content(
-        task, agent, members, config.assets, config.features, learner, config.updates, learned
-    )
+    return {
+        "task": task,
+        "agent": agent,
+        "members": members,
+        "assets": config.assets,
+        "features": config.features,
+        "learner": learner,
+        "updates": config.updates,
+        "learned": learned,
+    }
 
 
 def state_template(task: Portfolio, agent: Agent, seeds: int) -> PyTree:
