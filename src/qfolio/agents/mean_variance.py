@@ -183,12 +183,6 @@ class MeanVariance(Onlooker):
     def relearned(self, state: MeanVarianceState) -> int:
         return int(state.optimizer.count.max()) if self.returns else 0
 
-    def weights(self, state: MeanVarianceState) -> Efficient:
-        return state.policy
-
-    def policy(self, weights: Efficient, observation: View) -> Float[Array, "batch entry"]:
-        return weights(observation)
-
     def learn(
         self, task: Task, state: MeanVarianceState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[MeanVarianceState, Metrics]:

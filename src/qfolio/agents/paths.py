@@ -6,7 +6,7 @@ the policy and the loss.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -40,7 +40,7 @@ derivative then fit the cache of a core, for some members, too."""
 
 
 class OnPaths(Agent):
-    """The schedule and the rollouts; subclasses define the policy and ``learn``."""
+    """The schedule, the rollouts and how a policy acts; subclasses define it and ``learn``."""
 
     if TYPE_CHECKING:  # as in Agent
 
@@ -58,6 +58,14 @@ class OnPaths(Agent):
     @property
     def rollout_steps(self) -> int:
         return self.rollout_length
+
+    def weights(self, state: Any) -> Any:
+        return state.policy
+
+    def policy(
+        self, weights: Callable[[View], Array], observation: View
+    ) -> Float[Array, "batch entry"]:
+        return weights(observation)
 
     def _require_whole(self, task: Task) -> None:
         """Raises QfolioError if a rollout would span two episodes."""

@@ -242,12 +242,6 @@ class Pathwise(OnPaths):
             slope_optimizer=optimizer.begin(slopes) if slopes else None,
         )
 
-    def weights(self, state: PathwiseState) -> Band:
-        return state.policy
-
-    def policy(self, weights: Band, observation: View) -> Float[Array, "batch entry"]:
-        return weights(observation)
-
     def act(
         self, state: PathwiseState, observation: View, key: PRNGKeyArray
     ) -> Float[Array, "batch entry"]:

@@ -250,12 +250,6 @@ class Tilts(Onlooker):
     def relearned(self, state: TiltsState) -> int:
         return int(state.optimizer.count.max())
 
-    def weights(self, state: TiltsState) -> TiltPolicy:
-        return state.policy
-
-    def policy(self, weights: TiltPolicy, observation: View) -> Float[Array, "batch entry"]:
-        return weights(observation)
-
     def learn(
         self, task: Task, state: TiltsState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[TiltsState, Metrics]:
