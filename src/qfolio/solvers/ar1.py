@@ -56,7 +56,6 @@ def ar1(
     drifting: bool = True,
     signal_points: int | None = None,
     holding_parts: int = 4,
-    steps_per_year: int = 252,
 ) -> Ar1Optimum:
     """The best weights of one asset whose mean return follows a signal, with trading costs.
 
@@ -81,7 +80,6 @@ def ar1(
         signal_points: Size of the signal's grid, at least 11 (default: 201, or as many more as keep
             its points within a shock of each other).
         holding_parts: Cells of the grid of held weights between two levels.
-        steps_per_year: Turns growth per step into growth a year.
 
     Raises:
         QfolioError: A parameter is out of range, or returns below −100% are too likely.
@@ -155,7 +153,7 @@ def ar1(
             before, states = states, transition.T @ moved.reshape(states.shape)
             if np.abs(states - before).max() < 1e-12:
                 break
-        return steps_per_year * float((states * earned).sum())
+        return 252 * float((states * earned).sum())  # steps in a year
 
     growth = growth_of(actions)
     return Ar1Optimum(x, holdings, b, value, after, actions, growth, cost, growth_of)

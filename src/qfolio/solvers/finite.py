@@ -86,10 +86,8 @@ def soft(values: Values, epsilon: float) -> Float[np.ndarray, " state"]:
     return (1 - epsilon) * values.max(-1) + epsilon * values.mean(-1)
 
 
-def value_iteration(
-    model: Model, discount: float, epsilon: float = 0.0, tol: float = 1e-10
-) -> Values:
-    """Q to within ``tol``, by sweeps over all states, each of which multiplies the error by γ.
+def value_iteration(model: Model, discount: float, epsilon: float = 0.0) -> Values:
+    """Q to within 1e-10, by sweeps over all states, each of which multiplies the error by γ.
 
     Raises QfolioError unless 0 ≤ discount < 1 and 0 ≤ epsilon ≤ 1.
     """
@@ -99,7 +97,7 @@ def value_iteration(
         better = look_ahead(model, soft(values, epsilon), discount)
         change = float(np.abs(better - values).max())
         values = better
-        if change * discount <= tol * (1 - discount):
+        if change * discount <= 1e-10 * (1 - discount):
             return values
 
 

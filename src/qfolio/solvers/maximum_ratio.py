@@ -8,9 +8,7 @@ from qfolio.solvers.shared import at_bounds, require, solve, step_length
 from qfolio.solvers.sifting import sift
 
 
-def maximum_ratio(
-    mean: ArrayLike, covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-10
-) -> Floats:
+def maximum_ratio(mean: ArrayLike, covariance: ArrayLike, cap: float = 1.0) -> Floats:
     """The weights w that maximize μ'w/√(w'Σw) with 1'w = 1 and 0 ≤ w ≤ cap.
 
     The ratio does not depend on the scale of w, so that w = y/(1'y), where y minimizes
@@ -23,7 +21,6 @@ def maximum_ratio(
         mean: μ, shape (asset,).
         covariance: Σ, shape (asset, asset), positive semidefinite.
         cap: Largest weight, at least 1/assets.
-        tol: Largest gap between the primal and the dual value that is accepted, relative to μ'y.
 
     Returns:
         Weights of shape (asset,); those that are zero or at the cap are so exactly.
@@ -53,14 +50,14 @@ def maximum_ratio(
     return sift(
         -mu,
         cap,
-        lambda some: _interior_point(mu[some], sigma[np.ix_(some, some)], cap, tol),
+        lambda some: _interior_point(mu[some], sigma[np.ix_(some, some)], cap),
         lambda w: sigma @ w / (w @ sigma @ w) - mu / (mu @ w),
         tol=1e-7,
     )
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")  # steps that are not finite end it
-def _interior_point(mu: Floats, sigma: Floats, cap: float, tol: float) -> Floats:
+def _interior_point(mu: Floats, sigma: Floats, cap: float) -> Floats:
     """The weights of means of at most 1 and a mean variance of about 1; 1/assets < cap."""
     count = len(mu)
     capped, diagonal = cap < 1, np.diag_indices(count)
@@ -78,7 +75,7 @@ def _interior_point(mu: Floats, sigma: Floats, cap: float, tol: float) -> Floats
         size = float(mu @ y)
         gap = float(y @ z + s @ v)
         off = float(np.abs(slope - z - room(v)).max())
-        solved = gap <= tol * abs(size) and off <= tol
+        solved = gap <= 1e-10 * abs(size) and off <= 1e-10
         if solved:
             break
         target = 0.1 * gap / (count * (1 + capped))

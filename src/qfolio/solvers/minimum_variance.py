@@ -8,7 +8,7 @@ from qfolio.solvers.shared import at_bounds, require, solve, square, step_length
 from qfolio.solvers.sifting import sift
 
 
-def minimum_variance(covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-12) -> Floats:
+def minimum_variance(covariance: ArrayLike, cap: float = 1.0) -> Floats:
     """The weights w that minimize w'Σw with 1'w = 1 and 0 ≤ w ≤ cap.
 
     A primal-dual interior-point method (Wright 1997, chapter 5) from equal weights, with
@@ -19,7 +19,6 @@ def minimum_variance(covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-12
     Args:
         covariance: Σ, shape (asset, asset), positive semidefinite.
         cap: Largest weight, at least 1/assets.
-        tol: Largest mean of these products that is accepted, in units of the mean variance.
 
     Returns:
         Weights of shape (asset,); those that are zero or at the cap are so exactly.
@@ -37,13 +36,13 @@ def minimum_variance(covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-12
     return sift(
         np.diag(sigma),
         cap,
-        lambda some: _interior_point(sigma[np.ix_(some, some)], cap, tol),
+        lambda some: _interior_point(sigma[np.ix_(some, some)], cap),
         lambda w: sigma @ w,
         tol=1e-9,
     )
 
 
-def _interior_point(sigma: Floats, cap: float, tol: float) -> Floats:
+def _interior_point(sigma: Floats, cap: float) -> Floats:
     """The weights of a covariance with a mean variance of about 1; 1/assets < cap."""
     count = len(sigma)
     w = np.full(count, 1 / count)
@@ -51,7 +50,7 @@ def _interior_point(sigma: Floats, cap: float, tol: float) -> Floats:
     for _ in range(100):
         room = cap - w
         gap = float(w @ z + room @ v) / (2 * count)
-        if gap <= tol:
+        if gap <= 1e-12:  # in units of the mean variance
             break
         target = 0.1 * gap
         system = sigma + np.diag(z / w + v / room)

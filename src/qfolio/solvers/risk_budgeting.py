@@ -7,7 +7,7 @@ from qfolio.core.arrays import Floats
 from qfolio.solvers.shared import require, solve, square
 
 
-def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> Floats:
+def equal_risk(covariance: ArrayLike) -> Floats:
     """The weights w > 0 with w_i (Σw)_i equal for all i (risk parity).
 
     They minimize ½ w'Σw − Σ ln(w_i)/N up to a factor. The function is strictly convex, so Newton's
@@ -16,13 +16,12 @@ def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> Floats:
 
     Args:
         covariance: Σ, shape (asset, asset), positive semidefinite with positive variances.
-        tol: Largest relative difference between a contribution and the mean that is accepted.
 
     Returns:
         Weights of shape (asset,), which sum to 1.
 
     Raises:
-        QfolioError: The covariance is invalid, or the tolerance is not reached.
+        QfolioError: The covariance is invalid, or there is no convergence.
     """
     sigma = square(covariance)
     deviations = np.sqrt(np.maximum(np.diag(sigma), 0))
@@ -36,7 +35,7 @@ def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> Floats:
     )
     for _ in range(200):
         slope = correlations @ y - 1 / (count * y)
-        if np.max(np.abs(slope * y)) * count <= tol:
+        if np.max(np.abs(slope * y)) * count <= 1e-10:  # contributions relative to their mean
             break
         curvature = correlations + np.diag(1 / (count * y**2))
         step = solve(curvature, slope)

@@ -160,15 +160,14 @@ def active_returns(tested: TableReturns, agent: str, against: Against) -> Floats
     return paired_difference(log_growth(ours), log_growth(theirs))
 
 
-def pool(
-    tables: Mapping[str, TableReturns], agents: Sequence[str], seed: int = 0
-) -> dict[str, Pools]:
+def pool(tables: Mapping[str, TableReturns], agents: Sequence[str]) -> dict[str, Pools]:
     """Pool the evidence of tables on each agent, without Holm's correction.
+
+    All agents share the tables and days that the bootstrap draws.
 
     Args:
         tables: The tables by name, at least one.
         agents: Names of agents that all tables have.
-        seed: Seed of the bootstrap; all agents share the tables and days that are drawn.
     """
     keys = [(agent, against) for agent in agents for against in AGAINST]
     # Any number will do for a total loss, which has neither an interval nor a z.
@@ -178,7 +177,7 @@ def pool(
     ]
     years = [table.periods_per_year for table in tables.values()]
     annual = [year * daily for year, daily in zip(years, active, strict=True)]
-    drawn = hierarchical_bootstrap(annual, RESAMPLES, np.random.default_rng(seed))
+    drawn = hierarchical_bootstrap(annual, RESAMPLES, np.random.default_rng(0))
     known = {a: {name: evidence(table, a) for name, table in tables.items()} for a in agents}
     days = [table.days for table in tables.values()]
     pooled = {

@@ -59,14 +59,14 @@ def falls(returns: ArrayLike, count: int) -> list[Fall]:
     return sorted(found, key=lambda fall: -fall.depth)[:count]
 
 
-def value_at_risk(returns: ArrayLike, tail: float = TAIL) -> tuple[float, float]:
+def value_at_risk(returns: ArrayLike) -> tuple[float, float]:
     """Return the historical value at risk and the expected loss beyond it (CVaR), as losses.
 
-    Value at risk is the loss that a share ``tail`` of the returns exceed (the quantile with linear
+    Value at risk is the loss that a share ``TAIL`` of the returns exceed (the quantile with linear
     interpolation); CVaR is the mean loss of the returns at or below that quantile.
     """
     values = np.asarray(returns, dtype=float)
-    edge = np.quantile(values, tail)
+    edge = np.quantile(values, TAIL)
     return float(-edge), float(-values[values <= edge].mean())
 
 
