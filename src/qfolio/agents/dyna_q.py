@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from qfolio.agents.tabular import Move, TableState, Tabular
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require, static
-from qfolio.core.mdp import Metrics, Task, Transition
+from qfolio.core.mdp import Task
 
 
 class Counts(eqx.Module):
@@ -119,18 +119,14 @@ class DynaQ(Tabular):
         model = Counts.empty(states * actions, outcomes)
         return DynaState(state.cells, state.episodes, model)
 
-    def learn(
-        self, task: Task, state: DynaState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[DynaState, Metrics]:
+    def improve(self, state: DynaState, move: Move, key: PRNGKeyArray) -> DynaState:
         _, *shape = state.tables.shape
-        move = Move.of(rollout)
         state = self._update(state, move)
         entry = move.state * shape[1] + move.action
         outcome = jnp.where(move.terminated, shape[0], move.next_state)
         model = state.model.add(entry, outcome, move.reward)
         state = eqx.tree_at(lambda s: s.model, state, model)
-        state = self._update(state, model.imagine(self.planning_steps, (shape[0], shape[1]), key))
-        return self.observe(state, rollout), {}
+        return self._update(state, model.imagine(self.planning_steps, (shape[0], shape[1]), key))
 
     def _update(self, state: DynaState, move: Move) -> DynaState:
         return self.update(state, move, state.tables[0, move.next_state].max(-1))

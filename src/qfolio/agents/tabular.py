@@ -13,7 +13,8 @@ in v(s'), the estimate of the next state's value:
 docs/algorithms/tabular.md lists every formula and each deviation from the papers.
 """
 
-from typing import NamedTuple, TypeVar
+import abc
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -69,7 +70,7 @@ State = TypeVar("State", bound=TableState)
 
 
 class Tabular(Agent):
-    """A table of action values and ε-greedy actions; subclasses define ``learn``."""
+    """A table of action values and ε-greedy actions; subclasses define ``improve``."""
 
     num_envs: int = static(1)  # environments stepped side by side
     episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
@@ -123,6 +124,16 @@ class Tabular(Agent):
         values = self.action_values(state.tables, observation)
         return epsilon_greedy(key, values, self._epsilon(state.episodes))
 
+    def learn(
+        self, task: Task, state: State, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[State, Metrics]:
+        state = self.improve(state, Move.of(rollout), key)
+        return self.observe(state, rollout), {}
+
+    @abc.abstractmethod
+    def improve(self, state: Any, move: Move, key: PRNGKeyArray) -> Any:
+        """The state after learning from a step of each environment."""
+
     def observe(self, state: State, rollout: Transition) -> State:
         finished = (rollout.terminated | rollout.truncated).sum(dtype=jnp.int32)
         return eqx.tree_at(lambda s: s.episodes, state, state.episodes + finished)
@@ -166,25 +177,17 @@ def step_share(entry: Int[Array, " batch"], rate: Float[Array, " batch"]) -> Flo
 class QLearning(Tabular):
     """Q-learning: targets the best action's value, whichever action is taken."""
 
-    def learn(
-        self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[TableState, Metrics]:
-        move = Move.of(rollout)
-        state = self.update(state, move, state.tables[0, move.next_state].max(-1))
-        return self.observe(state, rollout), {}
+    def improve(self, state: TableState, move: Move, key: PRNGKeyArray) -> TableState:
+        return self.update(state, move, state.tables[0, move.next_state].max(-1))
 
 
 class ExpectedSarsa(Tabular):
     """Expected SARSA: targets the mean value of the ε-greedy policy's actions."""
 
-    def learn(
-        self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[TableState, Metrics]:
-        move, epsilon = Move.of(rollout), self._epsilon(state.episodes)
-        values = state.tables[0, move.next_state]
+    def improve(self, state: TableState, move: Move, key: PRNGKeyArray) -> TableState:
+        epsilon, values = self._epsilon(state.episodes), state.tables[0, move.next_state]
         following = (1 - epsilon) * values.max(-1) + epsilon * values.mean(-1)
-        state = self.update(state, move, following)
-        return self.observe(state, rollout), {}
+        return self.update(state, move, following)
 
 
 class DoubleQ(Tabular):
@@ -192,16 +195,12 @@ class DoubleQ(Tabular):
 
     count = 2
 
-    def learn(
-        self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[TableState, Metrics]:
-        move = Move.of(rollout)
+    def improve(self, state: TableState, move: Move, key: PRNGKeyArray) -> TableState:
         batch = jnp.arange(self.num_envs)
         learner = jax.random.bernoulli(key, shape=batch.shape).astype(jnp.int32)
         values = state.tables[:, move.next_state]
         following = bootstrap(values[1 - learner, batch], selector=values[learner, batch])
-        state = self.update(state, move, following, learner)
-        return self.observe(state, rollout), {}
+        return self.update(state, move, following, learner)
 
 
 class SarsaState(TableState):
@@ -226,17 +225,14 @@ class Sarsa(Tabular):
         last = Move(nowhere, zeros, zeros.astype(jnp.float32), zeros, never, never)
         return SarsaState(state.cells, state.episodes, last)
 
-    def learn(
-        self, task: Task, state: SarsaState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[SarsaState, Metrics]:
-        move, last = Move.of(rollout), state.last
+    def improve(self, state: SarsaState, move: Move, key: PRNGKeyArray) -> SarsaState:
+        last = state.last
         values = state.tables[0, last.next_state]
         drawn = epsilon_greedy(key, values, self._epsilon(state.episodes))
         action = jnp.where(last.truncated, drawn, move.action)
         following = jnp.take_along_axis(values, action[:, None], axis=1)[:, 0]
         state = self.update(state, last, following)
-        state = eqx.tree_at(lambda s: s.last, state, move)
-        return self.observe(state, rollout), {}
+        return eqx.tree_at(lambda s: s.last, state, move)
 
     def cut(self, state: SarsaState) -> SarsaState:
         return eqx.tree_at(lambda s: s.last.truncated, state, jnp.ones(self.num_envs, bool))
