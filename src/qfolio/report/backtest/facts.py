@@ -6,7 +6,7 @@ from collections import Counter
 from typing import Any
 
 from qfolio.core.statistics import FEWEST_SEEDS
-from qfolio.core.text import plural
+from qfolio.core.text import amount
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
 from qfolio.portfolio.calendars import PERIODS, band
 from qfolio.report.backtest.data import BacktestData
@@ -20,16 +20,16 @@ def key_facts(data: BacktestData) -> list[str]:
     facts = [
         str(data.prices["source"]),
         f"{test.first_date} to {test.last_date} ({years} years)",
-        f"{_counted(len(data.assets), 'asset')} and cash",
+        f"{amount(len(data.assets), 'asset')} and cash",
         *_universe(data.prices),
     ]
     if "cost" in settings:
         facts.append(f"{basis_points(settings['cost'])} of the value traded")
     if "lag" in settings:
-        facts.append(f"lag of {_counted(settings['lag'], unit)}")
+        facts.append(f"lag of {amount(settings['lag'], unit)}")
     if data.folds:
-        facts.append(_counted(len(data.folds), "fold"))
-    return [*facts, _counted(test.trials, "trial")]
+        facts.append(amount(len(data.folds), "fold"))
+    return [*facts, amount(test.trials, "trial")]
 
 
 def _universe(prices: dict[str, Any]) -> list[str]:
@@ -46,10 +46,10 @@ def universe(prices: dict[str, Any]) -> list[str]:
     """How assets enter and leave a table, in sentences; else that those that left are missing."""
     said = []
     if late := prices.get("late_assets"):
-        said.append(f"{_counted(late, 'asset')} joined after the first row.")
+        said.append(f"{amount(late, 'asset')} joined after the first row.")
     if ended := prices.get("delisted_assets"):
         said.append(
-            f"{_counted(ended, 'asset')} ended before the last row, and holdings became cash at "
+            f"{amount(ended, 'asset')} ended before the last row, and holdings became cash at "
             f"the last price, with {_haircut(prices)}."
         )
     if prices.get("has_members"):
@@ -67,10 +67,6 @@ def _haircut(prices: dict[str, Any]) -> str:
     return f"a haircut of {100 * lost:.4g}%" if lost else "no haircut"
 
 
-def _counted(count: int, noun: str) -> str:
-    return f"{number(count, 0)} {plural(noun, count)}"
-
-
 def unit_of(periods_per_year: float) -> str:
     """The name of a period."""
     known = {"day": (240, 370), "week": (48, 54), "month": (11, 13)}
@@ -83,11 +79,11 @@ def _counts(test: Assessment) -> str:
     kinds = Counter(entry.kind for entry in test.strategies.values())
     seeds = [entry.seeds for entry in test.strategies.values() if entry.kind == "agent"]
     if len(set(seeds)) == 1:
-        text = f"{_counted(len(seeds), 'agent')} × {_counted(seeds[0], 'seed')}"
+        text = f"{amount(len(seeds), 'agent')} × {amount(seeds[0], 'seed')}"
     else:
-        text = f"{_counted(len(seeds), 'agent')}, {_counted(sum(seeds), 'seed')} in all"
+        text = f"{amount(len(seeds), 'agent')}, {amount(sum(seeds), 'seed')} in all"
     if kinds["ensemble"]:
-        text += f", {_counted(kinds['ensemble'], 'ensemble')}"
+        text += f", {amount(kinds['ensemble'], 'ensemble')}"
     return f"{text}, {kinds['strategy']} of your own" if kinds["strategy"] else text
 
 
@@ -142,7 +138,7 @@ def _calendar(calendar: str, unit: str) -> str:
             "held; otherwise, holdings drift."
         )
     if calendar.isdecimal():
-        when = f"once in {_counted(int(calendar), unit)}, counted from the table’s first row"
+        when = f"once in {amount(int(calendar), unit)}, counted from the table’s first row"
     else:
         when = f"on the first {unit} of each {PERIODS[calendar]}"
     return (

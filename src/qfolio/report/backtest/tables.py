@@ -82,9 +82,7 @@ def _cell(
     if measure is None or math.isnan(measure.mean):
         return {"value": "–", "time": "", "seeds": "", "bar": None}
 
-    def written(value: float) -> str:
-        return percent(value) if key in _PERCENT else number(value, 1 if key == "turnover" else 2)
-
+    written = partial(_written, key)
     column = (getattr(data.assessment.strategies[n], table).get(key) for n in main_names(data))
     return {
         "value": written(measure.mean),
@@ -92,6 +90,11 @@ def _cell(
         "seeds": " … ".join(map(written, _over_seeds(measure))),
         "bar": _interval(measure.mean, measure.over_time, [each for each in column if each]),
     }
+
+
+def _written(key: str, value: float) -> str:
+    """A measure as text; key: its name."""
+    return percent(value) if key in _PERCENT else number(value, 1 if key == "turnover" else 2)
 
 
 def _interval(
@@ -187,11 +190,7 @@ def rebalancing_rows(data: BacktestData) -> list[dict[str, Any]]:
         {
             "name": name,
             "best": name == test.rebalanced,
-            "cells": [
-                percent(value) if key in _PERCENT else number(value, 1 if key == "turnover" else 2)
-                for key in keys
-                for value in (test.strategies[name].measures[key].mean,)
-            ],
+            "cells": [_written(key, test.strategies[name].measures[key].mean) for key in keys],
         }
         for name in (test.reference, *names)
         if names
