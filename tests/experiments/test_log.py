@@ -12,10 +12,10 @@ from qfolio.core.population import Population
 from qfolio.experiments import log as logs
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.events import EVENTS, read
-from qfolio.experiments.fit import fit
+from qfolio.experiments.fit import Training, fit
 from qfolio.experiments.log import Log, Tracker, _parts, means, tracked
 from qfolio.experiments.machines.messages import Report
-from qfolio.experiments.machines.remote import RemoteTraining, hear
+from qfolio.experiments.machines.remote import hear
 from qfolio.experiments.records import Records
 from qfolio.experiments.run import Run
 
@@ -134,25 +134,20 @@ def test_a_member_without_an_episode_has_no_mean():
     }
 
 
-def report(hook, seconds=1.0, left=0, rows=(), members=(), ends=()):
-    """What a worker says of a training."""
-    share, where = 1.0 if not left else 0.5, "process 7 on far"
-    return Report(hook, where, Budget(4), {}, 0, left, 100, seconds, share, 7.0, 3.0,
-                  Records.of(rows), [*members], [*ends])  # fmt: skip
+def training_far_away(left=0, members=(), ends=()):
+    """A training on a worker, as the driver hears of it."""
+    return Training(None, Budget(4), left=left, done=100, seconds=1.0, members=[*members],
+                    ends=[*ends], where="process 7 on far")  # fmt: skip
 
 
 def test_jobs_on_workers_are_logged_by_the_driver(tmp_path):
     with Log(tmp_path).opened(kind="backtest") as log:
         log.queue(["a"])
         job = log.job("a", ["seed 0"])
-        hear(report("on_start", left=2), job)
-        hear(
-            report(
-                "on_chunk", rows=[{"seed": 0, "episode": 1, "return": 2.5}], members=[0], ends=[4]
-            ),
-            job,
-        )
-        hear(report("on_end"), job)
+        rows = Records.of([{"seed": 0, "episode": 1, "return": 2.5}])
+        hear(Report("on_start", training_far_away(left=100), Records()), job)
+        hear(Report("on_chunk", training_far_away(members=[0], ends=[4]), rows), job)
+        hear(Report("on_end", training_far_away(), Records()), job)
     names = [event["event"] for event in logged(tmp_path)]
     assert names == ["start", "queued", "running", "record", "done", "end"]
     assert logged(tmp_path, "running")[0]["worker"] == "process 7 on far"
@@ -226,7 +221,7 @@ def test_logging_takes_little_of_a_training(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(logs, "perf_counter", lambda: now[0])
     members = [i % 8 for i in range(10)]
-    training = RemoteTraining(report("on_chunk", left=2, members=members, ends=[100] * 10))
+    training = training_far_away(left=100, members=members, ends=[100] * 10)
     row = dict.fromkeys(("seed", "episode", "return", "loss", "q"), 1.0)
     rows = Records.of([row] * 10)
     begun, chunks = process_time(), 20_000

@@ -377,7 +377,7 @@ class _Curve(Listener):
         self.job.record(done, {"greedy regret": self.regrets[-1]})
 
     def on_chunk(self, training: Training, rows: Records) -> None:
-        self.add(training.population, training.population.steps - training.begun)
+        self.add(training.population, training.done)
 
 
 def _learn(

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from qfolio.core.errors import require_list
+from qfolio.core.errors import QfolioError, require_list
 from qfolio.core.population import Population
 from qfolio.core.training import Episodes
 from qfolio.experiments.budget import Budget
@@ -22,14 +22,16 @@ from qfolio.experiments.records import Records
 
 @dataclass
 class Training:
-    """A training in progress, as its listeners see it.
+    """A training in progress, as its listeners see it, in this process or from a worker.
 
     Attributes:
-        population: The population in training.
         budget: The budget of each member.
         config: The configuration, for listeners that record it.
         begun: Steps of each environment before this training.
         left: Remaining steps of each environment.
+        done: Steps of each environment in this training so far.
+        num_envs: Environments of each member.
+        count: Number of members.
         seconds: Time spent on training, excluding compilation.
         members: The member that each row of the last chunk belongs to.
         ends: The steps of all environments of a member at the end of each row's episode.
@@ -37,11 +39,14 @@ class Training:
         where: The worker that the training runs on; empty in this process.
     """
 
-    population: Population
+    _population: Population | None  # None in a report from a worker
     budget: Budget
     config: Mapping[str, Any] = field(default_factory=dict)
     begun: int = 0
     left: int = 0
+    done: int = 0
+    num_envs: int = 1
+    count: int = 1
     seconds: float = 0.0
     members: Sequence[int] = ()
     ends: Sequence[int] = ()
@@ -51,6 +56,16 @@ class Training:
     _learning_seconds: float = 0.0
 
     @property
+    def population(self) -> Population:
+        """The population in training; raises QfolioError if it is on a worker."""
+        if self._population is None:
+            raise QfolioError(
+                "A listener asks for the population of a training that runs on a worker; it may "
+                "ask for progress and rows, or train in this process (--on here)."
+            )
+        return self._population
+
+    @property
     def finished(self) -> bool:
         """Whether the budget is used up."""
         return self.left == 0
@@ -58,19 +73,17 @@ class Training:
     @property
     def steps(self) -> int:
         """Steps of all environments of a member so far, earlier training included."""
-        return self.population.steps * self.population.agent.num_envs
+        return (self.begun + self.done) * self.num_envs
 
     @property
     def share(self) -> float:
         """The share of this training that is done, in steps."""
-        done = self.population.steps - self.begun
-        return done / max(done + self.left, 1)
+        return self.done / max(self.done + self.left, 1)
 
     @property
     def steps_per_second(self) -> float:
         """Environment steps of all members per second; once learning has begun, since then."""
-        per_step = self.population.agent.num_envs * len(self.population.seeds)
-        return self._rate * per_step
+        return self._rate * (self.num_envs * self.count)
 
     @property
     def seconds_left(self) -> float:
@@ -81,7 +94,7 @@ class Training:
     def _rate(self) -> float:
         if self._learned:
             return self._learned / max(self._learning_seconds, 1e-9)
-        return (self.population.steps - self.begun) / max(self.seconds, 1e-9)
+        return self.done / max(self.seconds, 1e-9)
 
     def advance(self, most: int, strict: bool) -> Records:
         """Trains one chunk of at most ``most`` steps; returns the episodes that it finished."""
@@ -95,6 +108,7 @@ class Training:
         records = population.advance(min(self.left, most), strict=strict)
         seconds = perf_counter() - start - (population.seconds_compile - compiled)
         self.seconds += seconds
+        self.done = population.steps - self.begun
         if learning:
             self._learned += population.steps - steps
             self._learning_seconds += seconds
@@ -102,7 +116,7 @@ class Training:
         if not strict and not any(population.healthy):
             self.left = 0
         rows, self.members, times = _records(population.seeds, episodes, records)
-        self.ends = ((steps + 1 + times) * population.agent.num_envs).tolist()
+        self.ends = ((steps + 1 + times) * self.num_envs).tolist()
         return rows
 
 
@@ -148,7 +162,15 @@ def fit(
             continue.
     """
     require_listeners(listeners)
-    training = Training(population, budget, config or {}, population.steps, budget.left(population))
+    training = Training(
+        population,
+        budget,
+        config or {},
+        begun=population.steps,
+        left=budget.left(population),
+        num_envs=population.agent.num_envs,
+        count=len(population.seeds),
+    )
     if training.finished:
         return training
     with interruptible() as stop:

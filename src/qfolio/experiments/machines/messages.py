@@ -2,13 +2,14 @@
 
 import os
 import platform
-from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from qfolio.core.version import __version__
-from qfolio.experiments.budget import Budget
 from qfolio.experiments.records import Records
+
+if TYPE_CHECKING:
+    from qfolio.experiments.fit import Training
 
 
 class Ready(NamedTuple):
@@ -22,19 +23,8 @@ class Report(NamedTuple):
     """The progress of a training, for its listeners in the driver."""
 
     hook: Literal["on_start", "on_chunk", "on_end"]
-    where: str  # the worker
-    budget: Budget
-    config: Mapping[str, Any]
-    begun: int
-    left: int
-    steps: int
-    seconds: float
-    share: float
-    steps_per_second: float
-    seconds_left: float
+    training: "Training"  # without its population
     rows: Records
-    members: Sequence[int]
-    ends: Sequence[int]
 
 
 class Done(NamedTuple):

@@ -1,10 +1,10 @@
 """The progress of trainings that run on workers, for listeners in the driver."""
 
+import dataclasses
 from collections.abc import Callable
 from time import perf_counter
-from typing import Any, Literal
+from typing import Literal
 
-from qfolio.core.errors import QfolioError
 from qfolio.experiments.fit import Listener, Training
 from qfolio.experiments.machines.messages import Report, place
 from qfolio.experiments.records import Records
@@ -37,68 +37,23 @@ class Reporter(Listener):
         self._report("on_end", training)
 
     def _report(self, hook: Literal["on_start", "on_chunk", "on_end"], training: Training) -> None:
-        self.send(
-            Report(
-                hook,
-                place(),
-                training.budget,
-                training.config,
-                training.begun,
-                training.left,
-                training.steps,
-                training.seconds,
-                training.share,
-                training.steps_per_second,
-                training.seconds_left,
-                Records.joined(self.rows),
-                self.members,
-                self.ends,
-            )
+        told = dataclasses.replace(
+            training,
+            _population=None,
+            where=place(),
+            members=self.members,
+            ends=self.ends,
+            interrupted=False,
         )
+        self.send(Report(hook, told, Records.joined(self.rows)))
         self.rows, self.members, self.ends = [], [], []
-
-
-class RemoteTraining(Training):
-    """A training on a worker, as last reported; its population stays on the worker."""
-
-    def __init__(self, report: Report) -> None:
-        self.budget, self.config, self.begun = report.budget, report.config, report.begun
-        self.left, self.seconds = report.left, report.seconds
-        self.members, self.ends = report.members, report.ends
-        self.interrupted, self.where = False, report.where
-        self._report = report
-
-    @property
-    def steps(self) -> int:
-        return self._report.steps
-
-    @property
-    def share(self) -> float:
-        return self._report.share
-
-    @property
-    def steps_per_second(self) -> float:
-        return self._report.steps_per_second
-
-    @property
-    def seconds_left(self) -> float:
-        return self._report.seconds_left
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "population":
-            raise QfolioError(
-                "A listener asks for the population of a training that runs on a worker; it may "
-                "ask for progress and rows, or train in this process (--on here)."
-            )
-        raise AttributeError(name)
 
 
 def hear(report: Report, listener: Listener) -> None:
     """Passes a worker's report to a listener."""
-    training = RemoteTraining(report)
     if report.hook == "on_chunk":
-        listener.on_chunk(training, report.rows)
+        listener.on_chunk(report.training, report.rows)
     elif report.hook == "on_start":
-        listener.on_start(training)
+        listener.on_start(report.training)
     else:
-        listener.on_end(training)
+        listener.on_end(report.training)
