@@ -87,6 +87,16 @@ def test_pauses_are_no_work_and_old_jobs_are_no_backlog(tmp_path):
     assert (done["jobs"], done["share"]) == ({"done": 1}, 1.0)
 
 
+def test_a_run_that_has_stopped_has_no_workers(tmp_path):
+    job = {**RUNNING, "job": "dqn/0", "worker": "process 7 on h"}
+    write(tmp_path, start(), job, {**record(9, 1.0, "dqn/0"), "rate": 100.0})
+    summary = read_again(tmp_path).summary("k")
+    assert (summary["workers"], summary["rate"]) == (1, 100.0)
+    write(tmp_path, {**END, "state": "stopped"})  # Ctrl-C ends workers at once
+    summary = read_again(tmp_path).summary("k")
+    assert (summary["workers"], summary["rate"]) == (0, None)
+
+
 def test_it_reads_on_where_it_stopped(tmp_path):
     write(tmp_path, start(), RUNNING, record(1, 1.0))
     experiment = read_again(tmp_path)

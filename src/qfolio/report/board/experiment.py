@@ -262,7 +262,8 @@ class Experiment:
     def summary(self, key: str) -> dict[str, Any]:
         """The entry in the list of experiments; key: the page's key for the experiment."""
         states = [job.state for job in self.jobs.values()]
-        running = [job for job in self.jobs.values() if job.state == "running"]
+        jobs = self.jobs.values() if self.state == "running" else ()
+        running = [job for job in jobs if job.state == "running"]
         first = next((job for job in self.jobs.values() if job.curves), None)
         spark = _spark(first) if first else []
         return {
