@@ -203,6 +203,14 @@ def test_agents_of_a_backtest_have_charts_of_their_own(
     assert all(0 <= end < 10 for end in ends)
 
 
+def test_a_time_of_almost_two_hours_is_two_hours(board: Board, browser: Browser) -> None:
+    browser.show(board.url, 1280)
+    times = [89, 90, 5369, 5370, 7169, 7170, 172_769, 172_770]
+    said = browser.evaluate(f"{times}.map(span).map((text) => text.replaceAll(THIN, ' '))")
+    hours = ["1 h 30 min", "1 h 59 min", "2 h 0 min", "47 h 59 min"]
+    assert said == ["89 s", "2 min", "89 min", *hours, "2 days"]
+
+
 EVIL = """<!doctype html><script>
 const target = "%s";
 const tries = {

@@ -68,8 +68,9 @@ function span(seconds) {
   if (seconds === null || !Number.isFinite(seconds)) return "–";
   const s = Math.round(Math.max(seconds, 0));
   if (s < 90) return `${s}${THIN}s`;
-  if (s < 5400) return `${Math.round(s / 60)}${THIN}min`;
-  if (s < 172800) return `${Math.floor(s / 3600)}${THIN}h ${Math.round(s / 60) % 60}${THIN}min`;
+  const m = Math.round(s / 60);
+  if (m < 90) return `${m}${THIN}min`;
+  if (m < 2880) return `${Math.floor(m / 60)}${THIN}h ${m % 60}${THIN}min`;
   return `${Math.round(s / 86400)} days`;
 }
 
