@@ -203,6 +203,19 @@ def test_agents_of_a_backtest_have_charts_of_their_own(
     assert all(0 <= end < 10 for end in ends)
 
 
+def test_an_axis_far_from_zero_names_its_ticks_in_full(board: Board, browser: Browser) -> None:
+    browser.show(board.url, 1280)
+    axes = [[-1478, -1469], [101.2, 101.9], [-0.35, 0.2], [0, 2e6], [1.2345e6, 1.2352e6]]
+    said = browser.evaluate(f"{axes}.map((axis) => ticks(axis, 4).map(short).join(' '))")
+    assert said == [
+        "−1477.5 −1475 −1472.5 −1470",
+        "101.2 101.4 101.6 101.8",
+        "−0.2 0 0.2",
+        "0 500k 1M 1.5M 2M",
+        "1.2346M 1.2348M 1.235M 1.2352M",
+    ]
+
+
 def test_a_time_of_almost_two_hours_is_two_hours(board: Board, browser: Browser) -> None:
     browser.show(board.url, 1280)
     times = [89, 90, 5369, 5370, 7169, 7170, 172_769, 172_770]

@@ -57,9 +57,9 @@ function number(x) {
   return text.replace("-", "−");
 }
 
-function short(x) { // of an axis
+function short(x) { // of an axis, whose ticks are round but for the last digits of sums
   const size = Math.abs(x);
-  const cut = (y) => String(+y.toPrecision(3));
+  const cut = (y) => String(+y.toPrecision(12));
   const text = size >= 1e6 ? `${cut(x / 1e6)}M` : size >= 1e4 ? `${cut(x / 1e3)}k` : cut(x);
   return text.replace("-", "−");
 }
