@@ -153,6 +153,21 @@ def test_a_long_log_is_read_in_several_answers(tmp_path, monkeypatch):
     assert known[-1] == 50
 
 
+def test_a_log_that_is_still_being_read_has_no_state_yet(tmp_path, monkeypatch):
+    """A finished run was shown as stopped until the end of its log had been read."""
+    monkeypatch.setattr(shelves, "FRESH", -1.0)
+    for name in ("a", "b"):
+        write(tmp_path / name, start(), {**END, "state": "done"})
+    shelf = Shelf(tmp_path)
+    monkeypatch.setattr(shelves, "READING", -1.0)  # no time to read anything
+    news = shelf.runs(0)
+    assert (news["keys"], news["runs"], news["reading"]) == ([], [], 2)
+    monkeypatch.setattr(shelves, "READING", 60.0)
+    news = shelf.runs(news["version"])
+    assert [run["state"] for run in news["runs"]] == ["done", "done"]
+    assert (len(news["keys"]), news["reading"]) == (2, 0)
+
+
 def test_a_page_gets_few_points_of_many_curves(monkeypatch, tmp_path):
     monkeypatch.setattr(experiments, "SHOWN", 60)
     jobs = [{**RUNNING, "job": name} for name in "abc"]

@@ -161,10 +161,14 @@ class Job:
 
 
 class Experiment:
-    """A folder with a log. version: the board's version when anything last changed."""
+    """A folder with a log. version: the board's version when anything last changed.
+
+    known: whether the log has been read to its end once; until then, the state says nothing.
+    """
 
     def __init__(self, name: str, log: Path) -> None:
         self.name, self.log, self.version = name, log, 0
+        self.known = False
         self._forget()
 
     def _forget(self) -> None:
@@ -191,16 +195,18 @@ class Experiment:
                 self._forget()
                 self._first, self.version = first, version
             self._touched = status.st_mtime
-            while self._offset < status.st_size and time.perf_counter() < until:
+            behind = self._offset < status.st_size
+            while behind and time.perf_counter() < until:
                 events, offset = read(self.log, self._offset)
-                if offset == self._offset:
-                    break
+                behind = self._offset < offset < status.st_size
                 self._offset = offset
                 for event in events:
                     self._take(event, version)
+            self.known = self.known or not behind
         except OSError:  # deleted, or on a disk that is gone
+            self.known = True
             return
-        seen = (self.state, (self.log.parent / REPORT).exists())
+        seen = (self.known, self.state, (self.log.parent / REPORT).exists())
         if seen != self._seen:
             self._seen, self.version = seen, version
 

@@ -34,16 +34,21 @@ class Shelf:
         self._lock = threading.Lock()
 
     def runs(self, since: int) -> dict[str, Any]:
-        """The summaries of experiments that have changed, and the keys of all."""
+        """The summaries of experiments that have changed, and the keys of all.
+
+        Those whose logs are still being read for the first time are only counted.
+        """
         with self._lock:
             self._refresh()
+            known = {key: each for key, each in self._experiments.items() if each.known}
             return {
                 "version": self._version,
                 "root": _readable(self.root.name),
-                "keys": list(self._experiments),
+                "reading": len(self._experiments) - len(known),
+                "keys": list(known),
                 "runs": [
                     experiment.summary(key)
-                    for key, experiment in self._experiments.items()
+                    for key, experiment in known.items()
                     if experiment.version > since
                 ],
             }

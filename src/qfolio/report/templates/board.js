@@ -20,7 +20,7 @@ const find = (id) => document.getElementById(id);
 const runs = new Map(); // key → what the list says
 const details = new Map(); // key → {version, jobs, results}
 const items = new Map(); // key → its place in the list
-let version = 0, chosen = [], following = true, connected = true, hovered = null;
+let version = 0, reading = 0, chosen = [], following = true, connected = true, hovered = null;
 
 // Elements ------------------------------------------------------------------------------------
 
@@ -136,10 +136,11 @@ function list() {
     if (find("runs").children[i] !== place) find("runs").insertBefore(place, find("runs").children[i] || null);
   });
   const counts = STATES.map((state) => [state, sorted.filter((run) => run.state === state).length]);
-  const text = counts.filter(([, n]) => n).map(([state, n]) => `${n} ${state}`).join(" · ");
+  const text = [...counts, ["being read", reading]].filter(([, n]) => n)
+    .map(([state, n]) => `${n} ${state}`).join(" · ");
   say(find("counts"), connected ? text || "No runs yet" : "The board’s server has stopped.");
   document.title = counts[0][1] ? `${counts[0][1]} running · qfolio` : "qfolio board";
-  find("none").hidden = sorted.length > 0;
+  find("none").hidden = sorted.length + reading > 0;
   if (following && sorted.length && chosen[0] !== sorted[0].key) {
     chosen = [sorted[0].key];
     draw();
@@ -469,7 +470,7 @@ async function look() {
     chosen = []; following = true;
     return;
   }
-  version = news.version;
+  ({ version, reading } = news);
   say(find("root"), news.root);
   for (const run of news.runs) { runs.set(run.key, run); item(run); }
   const keys = new Set(news.keys);
