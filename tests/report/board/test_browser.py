@@ -205,7 +205,7 @@ def test_agents_of_a_backtest_have_charts_of_their_own(
 
 def test_an_axis_far_from_zero_names_its_ticks_in_full(board: Board, browser: Browser) -> None:
     browser.show(board.url, 1280)
-    axes = [[-1478, -1469], [101.2, 101.9], [-0.35, 0.2], [0, 2e6], [1.2345e6, 1.2352e6]]
+    axes = [[-1478, -1469], [101.2, 101.9], [-0.35, 0.2], [0, 2e6], [1.2345e6, 1.2352e6], [0, 3e12]]
     said = browser.evaluate(f"{axes}.map((axis) => ticks(axis, 4).map(short).join(' '))")
     assert said == [
         "−1477.5 −1475 −1472.5 −1470",
@@ -213,6 +213,7 @@ def test_an_axis_far_from_zero_names_its_ticks_in_full(board: Board, browser: Br
         "−0.2 0 0.2",
         "0 500k 1M 1.5M 2M",
         "1.2346M 1.2348M 1.235M 1.2352M",
+        "0 1e+12 2e+12 3e+12",
     ]
 
 

@@ -60,7 +60,7 @@ function number(x) {
 function short(x) { // of an axis, whose ticks are round but for the last digits of sums
   const size = Math.abs(x);
   const cut = (y) => String(+y.toPrecision(12));
-  const text = size >= 1e6 ? `${cut(x / 1e6)}M` : size >= 1e4 ? `${cut(x / 1e3)}k` : cut(x);
+  const text = size >= 1e9 ? (+x.toPrecision(12)).toExponential() : size >= 1e6 ? `${cut(x / 1e6)}M` : size >= 1e4 ? `${cut(x / 1e3)}k` : cut(x);
   return text.replace("-", "−");
 }
 
