@@ -57,6 +57,19 @@ def test_states_follow_from_the_log_and_its_touch(tmp_path):
     assert read_again(tmp_path).state == "done"
 
 
+@pytest.mark.parametrize("hours", [-1, 1])
+def test_a_run_moves_whatever_the_clock_says(tmp_path, hours):
+    """A run that was killed before the clock was put back would run until that time came again."""
+    write(tmp_path, start(), RUNNING)
+    there = time.time() + 3600 * hours
+    os.utime(tmp_path / EVENTS, (there, there))
+    experiment = read_again(tmp_path)
+    assert experiment.state == "stopped"
+    os.utime(tmp_path / EVENTS, (there + 2, there + 2))  # it lives, on a server with that clock
+    experiment.refresh(2)
+    assert experiment.state == "running"
+
+
 def test_a_search_runs_as_long_as_one_of_its_processes_does(tmp_path):
     write(tmp_path, start(kind="search"), start(kind="search", pid=2), END)
     assert read_again(tmp_path).state == "running"

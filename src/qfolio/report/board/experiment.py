@@ -173,6 +173,7 @@ class Experiment:
 
     def _forget(self) -> None:
         self._offset, self._first, self._touched = 0, b"", 0.0
+        self._moved = -math.inf  # when the touch was seen to change, by perf_counter
         self.about = Start(0.0)
         self.begun: float | None = None  # the first time
         self.paused = 0.0  # seconds without work between that and the last event
@@ -194,6 +195,8 @@ class Experiment:
             if status.st_size < self._offset or first != self._first:
                 self._forget()
                 self._first, self.version = first, version
+            if self._touched and self._touched != status.st_mtime:
+                self._moved = time.perf_counter()
             self._touched = status.st_mtime
             behind = self._offset < status.st_size
             while behind and time.perf_counter() < until:
@@ -212,9 +215,16 @@ class Experiment:
 
     @property
     def state(self) -> State:
-        if self._working and time.time() - self._touched < SILENT:
+        if self._working and self._alive:
             return "running"
         return "stopped" if self.end is None else self.end.state
+
+    @property
+    def _alive(self) -> bool:
+        """Whether the log was touched lately, by this clock or by that of a file server."""
+        if abs(time.time() - self._touched) < SILENT:
+            return True
+        return time.perf_counter() - self._moved < SILENT
 
     def _take(self, event: Event, version: int) -> None:
         try:
