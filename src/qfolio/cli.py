@@ -58,22 +58,17 @@ def commands() -> dict[str, Callable[..., Any]]:
 
 def run() -> NoReturn:
     """Runs the command line; an error of the user becomes one sentence and exit code 2."""
-    from qfolio.core.errors import QfolioError, sentence_on
+    from qfolio.core.errors import told
 
     try:
         try:
             _call(sys.argv[1:])
         finally:
             sys.stdout.flush()  # here, where a broken pipe is expected
-    except QfolioError as error:
-        _refuse(str(error))
     except BrokenPipeError:  # such as: qfolio prices table.csv | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discards the rest
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        _refuse(f"{where}{error.strerror or error}.")
     except Exception as error:
-        if (sentence := sentence_on(error)) is None:
+        if (sentence := told(error)) is None:
             raise
         _refuse(sentence)
     except KeyboardInterrupt:

@@ -1,5 +1,6 @@
 """The log of an experiment: what it says, and that nothing counts twice."""
 
+import errno
 import os
 from time import process_time
 
@@ -100,6 +101,15 @@ def test_an_error_ends_the_log(tmp_path, agent):
         run.train()
     last = logged(tmp_path / "run")[-1]
     assert (last["state"], last["error"]) == ("failed", str(raised.value))
+
+
+def test_a_full_disk_is_named_in_the_log(tmp_path):
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "runs/mine/metrics.csv")
+    with pytest.raises(OSError, match="No space"), Log(tmp_path).opened(kind="run"):
+        raise full
+    last = logged(tmp_path)[-1]
+    assert last["state"] == "failed"
+    assert last["error"] == "runs/mine/metrics.csv: No space left on device."
 
 
 def test_a_cut_line_is_left_until_it_is_whole_and_skipped_if_never(tmp_path):

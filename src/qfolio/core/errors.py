@@ -113,6 +113,16 @@ def sentence_on(error: BaseException) -> str | None:
     return None if own is None else f"{own.name} failed: {one_line(error)}."
 
 
+def told(error: BaseException) -> str | None:
+    """What to tell a user of an error; None if only a traceback says enough."""
+    if isinstance(error, QfolioError):
+        return str(error)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror or error}."
+    return sentence_on(error)
+
+
 def own_frame(error: BaseException) -> traceback.FrameSummary | None:
     """The last place in a user's own code that an exception passed; None if there is none."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from qfolio.core.errors import QfolioError, one_line
+from qfolio.core.errors import QfolioError, one_line, told
 from qfolio.core.files import naming
 from qfolio.experiments.events import BEAT, EVENTS
 from qfolio.experiments.fit import Listener, Training
@@ -100,7 +100,7 @@ class Log:
                 yield self
             except BaseException as error:
                 failed = isinstance(error, Exception)
-                why = {"error": str(error)} if isinstance(error, QfolioError) else {}
+                why = {"error": told(error)} if failed and told(error) else {}
                 self.write("end", state="failed" if failed else "stopped", **why, **here)
                 raise
             self.write("end", state=self.state, **here)
