@@ -57,6 +57,17 @@ def test_n_and_n_episodes_equal_2n(task, agent, tmp_path):
     assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
 
 
+def test_a_run_that_was_moved_says_so_and_goes_on_there(task, agent, tmp_path):
+    create(task, agent, tmp_path / "straight").train()
+    run = create(task, agent, tmp_path / "run")
+    moved = tmp_path / "moved"
+    with pytest.raises(QfolioError, match="run is gone; if it was moved, resume it there"):
+        run.train(listeners=[Tell(lambda *_: moved.exists() or run.folder.rename(moved))])
+    assert not run.folder.exists()
+    Run.open(moved).train()
+    assert_same(moved, tmp_path / "straight")
+
+
 def test_a_run_is_opened_with_what_it_was_trained_with(task, agent, tmp_path):
     """Another agent would train on, and config.json would still name the first."""
     create(task, agent, tmp_path / "run", seeds=1).train()

@@ -13,7 +13,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from qfolio.core.config import Config, read_config, write_config
-from qfolio.core.files import naming, read_tree, tidy, write_bytes, write_json, write_tree
+from qfolio.core.files import (
+    naming,
+    read_tree,
+    require_there,
+    tidy,
+    write_bytes,
+    write_json,
+    write_tree,
+)
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.records import Records, Row
 
@@ -55,7 +63,10 @@ class RunConfig(Config, frozen=True):
 
 
 class RunFolder:
-    """Reads and writes a run's files."""
+    """Reads and writes a run's files.
+
+    Writing raises QfolioError if the folder was moved or deleted.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -72,6 +83,7 @@ class RunFolder:
 
     def write_checkpoint(self, state: Any, weights: Any) -> None:
         """Writes policy and checkpoint; the checkpoint comes last because it marks the progress."""
+        require_there(self.path)
         write_tree(self.path / POLICY, weights)
         write_tree(self.path / CHECKPOINT, state)
 
@@ -82,6 +94,7 @@ class RunFolder:
     def append(self, name: str, rows: Records) -> None:
         """Appends rows to a table, with a header if it is new."""
         if rows:
+            require_there(self.path)
             with naming(self.path / name), (self.path / name).open("ab") as file:
                 file.write(rows.csv(header=file.tell() == 0))
 
