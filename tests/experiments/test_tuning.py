@@ -20,6 +20,7 @@ from qfolio.core.evaluation import start_keys
 from qfolio.core.fields import constant, require
 from qfolio.core.population import Population
 from qfolio.experiments.budget import Budget
+from qfolio.experiments.events import EVENTS, read
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import Run
@@ -273,6 +274,31 @@ def test_diverged_trials_are_pruned_and_never_best(tmp_path, task, agent):
     best = best_of(work.journal.trials())
     assert best is not None
     assert best.values == {"learning_rate": "0.001"}
+
+
+def test_the_log_tells_fresh_seeds_from_those_of_the_search(tmp_path, task, agent):
+    """The board named the best of many trials' returns as if it were a result."""
+    work = start(tmp_path / "s", task, agent)
+    work.run()
+    trials = work.journal.trials()
+    best, preset = best_of(trials), next(trial for trial in trials if trial.is_preset)
+    assert best is not None
+    tried = {"best": best.value, "preset": preset.value}
+
+    def logged() -> list[Any]:
+        events, _ = read(tmp_path / "s" / EVENTS)
+        return [event["values"] for event in events if event["event"] == "result"]
+
+    assert logged()[-1] == {name: {"return_in_search": value} for name, value in tried.items()}
+    summary = work.conclude()
+    fresh = {"best": summary["return_per_seed"], "preset": summary["preset_return_per_seed"]}
+    assert logged()[-1] == {
+        name: {"return": pytest.approx(np.mean(fresh[name])), "return_in_search": value}
+        for name, value in tried.items()
+    }
+    count = len(logged())
+    assert work.conclude() == summary
+    assert len(logged()) == count
 
 
 def test_a_search_where_all_diverge_says_so(tmp_path, task, agent):

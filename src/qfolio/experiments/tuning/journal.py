@@ -185,6 +185,11 @@ def best_of(trials: Sequence[Trial]) -> Trial | None:
     return max(finite, key=lambda trial: trial.value, default=None)
 
 
+def preset_of(trials: Sequence[Trial]) -> Trial | None:
+    """The trial of the preset's own settings; None if it has not finished or is not searched."""
+    return next((trial for trial in trials if trial.is_preset), None)
+
+
 def _drop_cut_line(journal: Path, lock: JournalFileOpenLock) -> None:
     """Removes a last line that a crash has cut short; Optuna could not read past it."""
     if not journal.exists():

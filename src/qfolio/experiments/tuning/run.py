@@ -33,11 +33,12 @@ from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Job, carry_out, persistent
 from qfolio.experiments.fit import Listener, Training
-from qfolio.experiments.log import Log
+from qfolio.experiments.log import Log, add_result
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.records import Records
+from qfolio.experiments.run_folder import SUMMARY
 from qfolio.experiments.tuning import search
-from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
+from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of, preset_of
 from qfolio.experiments.tuning.search import Value
 from qfolio.experiments.tuning.trials import TrialsJob, trials_jobs
 
@@ -241,9 +242,7 @@ class Tuning:
                     break
                 if listener is not None:
                     listener(now)
-                found = {"best": now.best, "preset": now.preset}
-                values = {name: {"return": trial.value} for name, trial in found.items() if trial}
-                log.write("result", values=values)
+                log.write("result", values=self._results(now.best, now.preset))
                 self.interrupted &= now.done < total
             log.settle(not self.interrupted)
 
@@ -299,10 +298,8 @@ class Tuning:
                 "learning rates, or bound the gradient (huber_delta or max_grad_norm, whichever "
                 "the agent has)."
             )
-        path = self.folder / "summary.json"
-        with contextlib.suppress(QfolioError):  # missing or damaged: it is made again
-            if (summary := read_json(path)).get("best") == found.values:
-                return summary
+        if (summary := self._summary(found)) is not None:
+            return summary
         seeds = range(FRESH, FRESH + self.config.fresh_seeds)
         agents = {"best": self.configured(found.values), "preset": self.agent}
         with self._log() as log:
@@ -322,8 +319,27 @@ class Tuning:
             "optimum": optimum(start_keys()),
             "optimum_tuned_on": optimum(tuning_keys()),
         }
-        write_json(path, summary)
+        write_json(self.folder / SUMMARY, summary)
+        add_result(self.folder, self._results(found, preset_of(trials)))
         return summary
+
+    def _summary(self, best: Trial) -> dict[str, Any] | None:
+        """The content of summary.json if it is about this configuration."""
+        with contextlib.suppress(QfolioError):  # missing or damaged: it is made again
+            if (summary := read_json(self.folder / SUMMARY)).get("best") == best.values:
+                return summary
+        return None
+
+    def _results(self, best: Trial | None, preset: Trial | None) -> dict[str, dict[str, Any]]:
+        """What the log says of both: the return in the search, which flatters, and a fresh one."""
+        tried = {"best": best, "preset": preset}
+        values = {name: {"return_in_search": x.value} for name, x in tried.items() if x}
+        if best is not None and (summary := self._summary(best)) is not None:
+            fresh = {"best": "return_per_seed", "preset": "preset_return_per_seed"}
+            for name, key in fresh.items():
+                known = [math.nan if x is None else x for x in summary[key]]
+                values[name] = {"return": float(np.mean(known)), **values.get(name, {})}
+        return values
 
     def _train(
         self,
@@ -357,7 +373,7 @@ class Tuning:
             total=self.config.trials,
             diverged=sum(math.isnan(trial.value) for trial in trials),
             best=best_of(trials),
-            preset=next((trial for trial in trials if trial.is_preset), None),
+            preset=preset_of(trials),
             seconds=seconds,
             trials=len(asked),
         )
