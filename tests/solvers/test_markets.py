@@ -259,6 +259,14 @@ def test_ar1_limits(signal_market: Ar1Optimum) -> None:
     assert blind.growth < signal_market.growth - 0.005 < free.growth
 
 
+def test_ar1_follows_the_distribution_only_for_its_growth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At high costs it settles so slowly that a market, which needs the policy, waited minutes."""
+    monkeypatch.setattr(np, "bincount", None)
+    optimum = ar1(signal_points=51)
+    monkeypatch.undo()
+    assert optimum.growth > 0
+
+
 # ------------------------------------------------------------------------------- no-trade region
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,12 +30,15 @@ class Ar1Optimum:
     """The same after moving to the level and paying the cost."""
     actions: Int[np.ndarray, "s h"]
     """Best level, as an index."""
-    growth: float
-    """Log growth of the best policy, a year."""
     cost: float
     """Proportional cost, one way."""
     growth_of: Callable[[Int[np.ndarray, "s h"]], float]
     """Stationary growth a year of any table of actions."""
+
+    @cached_property
+    def growth(self) -> float:
+        """Log growth of the best policy, a year; at high costs it takes minutes."""
+        return self.growth_of(self.actions)
 
     def policy(self, x: ArrayLike, weight: ArrayLike) -> Int[np.ndarray, "..."]:
         """Index of the best level at any signal x and weight held; both broadcast."""
@@ -155,5 +159,4 @@ def ar1(
                 break
         return 252 * float((states * earned).sum())  # steps in a year
 
-    growth = growth_of(actions)
-    return Ar1Optimum(x, holdings, b, value, after, actions, growth, cost, growth_of)
+    return Ar1Optimum(x, holdings, b, value, after, actions, cost, growth_of)
