@@ -192,6 +192,12 @@ def test_regimes_that_make_no_sense(name, value):
         settings.build(Regime, {name: value})
 
 
+def test_ar1_looks_at_most_ten_thousand_steps_ahead():
+    with pytest.raises(QfolioError, match=r"^horizon is 10001; it must be from 1 to 10,000\.$"):
+        Ar1(horizon=10_001)
+    assert Ar1(horizon=10_000).horizon == 10_000
+
+
 def test_the_regime_pays_what_was_seen():
     task = Regime(cost=0.005)
     for market, sign in ((0, -1), (1, 1)):

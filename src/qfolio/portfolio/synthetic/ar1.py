@@ -40,6 +40,8 @@ class Ar1(OneAsset):
     def __check_init__(self) -> None:
         require(self, "rho", lambda x: 0 <= x <= 0.999, "from 0 to 0.999")
         require(self, "noise volatility", lambda x: 0 < x <= 10, "above 0 and at most 10")
+        # Beyond these, its solver would look ahead for too long.
+        require(self, "horizon", lambda x: x <= 10_000, "from 1 to 10,000")
         require_cost(self)
         # Five standard deviations of the signal and the return must leave the price positive.
         worst = abs(self.drift) + 5 * abs(self.slope) * self.spread + 5 * self.volatility
