@@ -181,6 +181,7 @@ def test_regimes_may_differ_in_how_long_they_last_and_what_they_pay():
     ("name", "value"),
     [
         ("stay", "1"),
+        ("stay", "0.9,0.999999"),
         ("stay", "0.9,0.9,0.9"),
         ("mean", "0"),
         ("mean", "0.01,0.001"),

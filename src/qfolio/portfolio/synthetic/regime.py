@@ -30,7 +30,8 @@ class Regime(OneAsset):
     def __check_init__(self) -> None:
         one_or_two = "one number, or one for bad and one for good times"
         require(self, "stay mean", lambda x: len(x) in (1, 2), one_or_two)
-        require(self, "stay", lambda x: 0 <= min(x) <= max(x) < 1, "at least 0 and below 1")
+        # In longer regimes the search for the bands would take hours.
+        require(self, "stay", lambda x: 0 <= min(x) <= max(x) <= 0.9999, "from 0 to 0.9999")
         if not -0.5 <= self.means[0] < self.means[1] <= 0.5:
             raise QfolioError(
                 f"mean is {self.mean}; it must be above 0 and at most 0.5, or two numbers from "
