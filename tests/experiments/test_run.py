@@ -21,6 +21,7 @@ from qfolio.core.files import write_arrays
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.ar1 import Ar1
+from qfolio.portfolio.synthetic.kelly import Kelly
 
 from listeners import Interrupt, Tell
 from probes import Explosive
@@ -357,6 +358,14 @@ def test_summary(task, agent, tmp_path):
     shortfall = summary["optimum"] - np.array(summary["return_per_seed"])
     np.testing.assert_allclose(summary["regret_per_seed"], shortfall / abs(summary["optimum"]))
     assert run.config.seed == 5
+
+
+def test_there_is_no_share_of_an_optimum_of_zero(tmp_path):
+    """Of a bet that loses on average nothing is staked, and the best growth is 0."""
+    task, agent = Kelly(probability=0.4, horizon=10), Pathwise(rollout_length=10, num_envs=8)
+    summary = train(task, agent, episodes=8, seeds=2, out=tmp_path / "run").summary()
+    assert (summary["optimum"], summary["regret_per_seed"]) == (0.0, None)
+    assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
 
 
 def spoil_checkpoint(folder, how):

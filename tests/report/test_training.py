@@ -503,6 +503,19 @@ def test_market_report(tmp_path: Path) -> None:
         assert word not in text, word
 
 
+def test_market_where_the_best_is_to_earn_nothing() -> None:
+    """The curve stays in view, although no share of the optimum can be missed."""
+    market = make_market()
+    summary = {**market.summary, "optimum": 0.0, "regret_per_seed": None}
+    curve = replace(market.curve, returns=market.curve.returns - 0.2)
+    market = replace(market, summary=summary, curve=curve, optimum=0.0)
+    low, high = draw_learning_curve(market, 7.2).axes[0].get_ylim()
+    assert low < curve.returns.min() < 0 < high
+    text = text_of(render_page(market))
+    assert ", where the exact optimum is 0." in text
+    assert not re.search("Regret|None|nan", text)
+
+
 def test_market_with_one_seed() -> None:
     text = text_of(render_page(make_market(seeds=1)))
     assert "low 0.410 0.410 high" in text

@@ -20,6 +20,7 @@ from qfolio.solvers.followed import FollowedOptimum
 def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
     """Returns, optimum and regret of each member's greedy policy, as JSON values.
 
+    Regrets are None if the optimum is unknown or 0.
     starts: how many of the fixed start states (default: those of the population's kind). Raises
     QfolioError if a return is not finite.
     """
@@ -41,7 +42,8 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
     optimum, regrets = None, None
     if solution is not None:
         optimum = float(solution.returns(keys).mean())
-        regrets = regret(returns, optimum).tolist()
+        if optimum:  # there is no share of zero
+            regrets = regret(returns, optimum).tolist()
     interval = mean_interval(returns)
     return {
         "return_mean": float(returns.mean()),

@@ -188,7 +188,8 @@ class Run(Seeds):
         """Grades each seed's greedy policy on the first fixed start states.
 
         Returns return_mean, return_ci95, return_per_seed, optimum, regret_per_seed (as shares of
-        the optimum's absolute value), overestimation_per_seed and rule; what is unknown is None.
+        the optimum's absolute value; None if it is 0), overestimation_per_seed and rule; what is
+        unknown is None.
         Raises QfolioError if a return is not finite.
         """
         return grade(self.population, starts)

@@ -148,9 +148,9 @@ class ReportData:
         summary: The results: task, agent, preset, seeds, episodes, env_steps, seconds_compile,
             seconds_train, steps_per_second (of all seeds; episodes and env_steps are those of
             one), return_mean, return_ci95 (low, high; None for few seeds), return_per_seed,
-            optimum, regret_per_seed (shares of the optimum), overestimation_per_seed (None if no
-            action values are estimated) and, in markets, rule: a few numbers that describe a
-            policy, "exact" and "per_seed".
+            optimum, regret_per_seed (shares of the optimum; None if it is 0),
+            overestimation_per_seed (None if no action values are estimated) and, in markets, rule:
+            a few numbers that describe a policy, "exact" and "per_seed".
         config: All settings, a nested dictionary.
         curve: The reported run.
         comparison: The same run with one setting changed, or None.

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -116,9 +115,10 @@ def _distance(summary: dict[str, Any]) -> str:
     """Return the distance of the result from the optimum, if that is known."""
     if summary["optimum"] is None:
         return ""
-    optimum, regret = number(summary["optimum"], _digits(summary)), _mean_regret(summary)
-    if not math.isfinite(regret):  # the optimum is 0
+    optimum = number(summary["optimum"], _digits(summary))
+    if not summary["optimum"]:
         return f", where the exact optimum is {optimum}"
+    regret = _mean_regret(summary)
     share = percent(abs(regret))
     if share == percent(0):
         return f", equal to the exact optimum of {optimum} within a tenth of a percent"
@@ -145,11 +145,10 @@ def _facts(
     speed = ("Steps per second", amount(summary["steps_per_second"]), together)
     facts = [("Return", number(summary["return_mean"], digits), _over_seeds(summary))]
     if summary["optimum"] is not None:
+        facts.append(("Exact optimum", number(summary["optimum"], digits), "on the same starts"))
+    if summary["regret_per_seed"] is not None:
         regret = percent(_mean_regret(summary), 2 if market else 1)
-        facts += [
-            ("Exact optimum", number(summary["optimum"], digits), "on the same starts"),
-            ("Regret", regret, "of the optimum"),
-        ]
+        facts.append(("Regret", regret, "of the optimum"))
     facts += [
         (
             "Training time",

@@ -54,7 +54,7 @@ def draw_learning_curve(data: ReportData, width: float) -> Figure:
     _draw_training(whole, data)
     whole.set_xlim(left=0)
     _draw_optimum(whole, data)
-    if data.market:
+    if data.market and data.optimum:
         _cut_beginning(whole, data.optimum)
     whole.legend(loc="best", labelcolor=palette.MUTED)
     if panels == 2:
