@@ -314,6 +314,14 @@ def test_loadings_that_make_no_sense(loading):
         GarleanuPedersen(loading=loading)
 
 
+def test_factors_that_hardly_decay_have_a_spread():
+    with pytest.raises(QfolioError, match=r"^phi is 1e-08; it must be from 1e-5 to 1\.$"):
+        GarleanuPedersen(phi=1e-8)
+    slow = GarleanuPedersen(phi=1e-5)
+    exact = 0.066 / (1 - (1 - 1e-5) ** 2) ** 0.5
+    assert float(slow.tables.spread[0]) == pytest.approx(exact, rel=0.01)
+
+
 def test_sales_that_make_no_sense():
     with pytest.raises(QfolioError, match=r"^temporary is 2\.5"):
         Liquidation(permanent=5.0)

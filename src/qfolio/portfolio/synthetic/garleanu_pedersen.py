@@ -128,7 +128,8 @@ class GarleanuPedersen(QuadraticCosts):
 
     def __check_init__(self) -> None:
         require(self, "loading", lambda x: -1e6 <= x <= 1e6, "from -1e6 to 1e6")
-        require(self, "phi", lambda x: 0 < x <= 1, "above 0 and at most 1")
+        # Of a smaller one, float32 could not tell the factor's spread.
+        require(self, "phi", lambda x: 1e-5 <= x <= 1, "from 1e-5 to 1")
         require(self, "noise cost_scale variance", lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")
 
     @property
