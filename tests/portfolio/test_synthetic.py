@@ -326,6 +326,8 @@ def test_sales_that_make_no_sense():
     with pytest.raises(QfolioError, match=r"^temporary is 2\.5"):
         Liquidation(permanent=5.0)
     assert Liquidation(permanent=5.0, horizon=10).horizon == 10  # smaller steps
+    with pytest.raises(QfolioError, match=r"^permanent is inf; it must be from 0 to 1e6\.$"):
+        Liquidation(permanent=float("inf"))
 
 
 @pytest.mark.parametrize("kind", [GarleanuPedersen, Signals])

@@ -38,10 +38,10 @@ class Liquidation(Synthetic):
     def __check_init__(self) -> None:
         positive = "volatility temporary risk_aversion days"
         require(self, positive, lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")
+        require(self, "permanent", lambda x: 0 <= x <= 1e6, "from 0 to 1e6")
         # Half of a step's permanent impact; the base refuses a horizon of 0.
         half = self.permanent * self.days / max(self.horizon, 1) / 2
         require(self, "temporary", lambda x: x > half, f"above {half}, or fast sales cost nothing")
-        require(self, "permanent", lambda x: x >= 0, "at least 0")
 
     @property
     def _tau(self) -> Float[Array, ""] | float:
