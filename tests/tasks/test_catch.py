@@ -42,6 +42,8 @@ def test_enumeration_finds_the_optimum(task):
 def test_with_fewer_rows_no_paddle_is_in_time():
     with pytest.raises(QfolioError, match="more rows"):
         Catch(rows=3, columns=7)
+    with pytest.raises(QfolioError, match="would be down in 1 step, before"):
+        Catch(rows=3, columns=7, decoys=1)
     with pytest.raises(QfolioError, match="decoys"):
         Catch(columns=4, decoys=4)
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require, static
 from qfolio.core.mdp import Discrete, Step, Task
+from qfolio.core.text import amount
 
 
 class CatchState(NamedTuple):
@@ -46,8 +47,8 @@ class Catch(Task):
             )
         if self.horizon < self.columns // 2:
             raise QfolioError(
-                f"rows is {self.rows}; the ball would be down in {self.horizon} steps, before the "
-                f"paddle can reach all {self.columns} columns; use more rows."
+                f"rows is {self.rows}; the ball would be down in {amount(self.horizon, 'step')}, "
+                f"before the paddle can reach all {self.columns} columns; use more rows."
             )
 
     @property
