@@ -14,9 +14,10 @@ from qfolio.core.evaluation import start_keys
 from qfolio.core.population import Population
 from qfolio.experiments import continual
 from qfolio.experiments.budget import Budget
-from qfolio.experiments.continual import Course, Plan, compare, create, recovery, renew
+from qfolio.experiments.continual import Course, Grades, Plan, compare, create, recovery, renew
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.presets import preset
+from qfolio.portfolio.synthetic.kelly import Kelly
 from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.report.continual import render_page, verdict
 from qfolio.tasks.catch import Catch
@@ -188,6 +189,11 @@ def test_an_agent_without_a_schedule_cannot_go_on():
     """It is refused before anything is trained, and before a folder is written."""
     with pytest.raises(QfolioError, match="QLearning has no learning-rate schedule"):
         Plan(OLD, NEW, QLearning(), EPISODES)
+
+
+def test_there_is_no_share_of_an_optimum_of_zero():
+    with pytest.raises(QfolioError, match=r"that of Kelly\(.*probability=0\.4.*\) is 0; choose"):
+        Grades(Kelly(probability=0.4))
 
 
 def test_a_task_without_numbers_cannot_change():

@@ -341,12 +341,20 @@ def renew(agent: Agent, learned: TrainingState, fresh: TrainingState) -> Trainin
 
 
 class Grades:
-    """The exact optimum of one world, and the regrets of policies in it."""
+    """The exact optimum of one world, and the regrets of policies in it.
+
+    Raises QfolioError if the optimum is 0, of which there are no shares.
+    """
 
     def __init__(self, task: Task) -> None:
         solution = task.optimum()
         assert solution is not None
         self.task, self._best = task, solution.returns(start_keys())
+        if not self.optimum:
+            raise QfolioError(
+                f"Recovery is measured in shares of the optimum, but that of {task} is 0; "
+                "choose another task or change."
+            )
 
     @property
     def optimum(self) -> float:
