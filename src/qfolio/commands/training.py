@@ -268,7 +268,7 @@ def _train(
 
     optimum = None
     if run.task.optimum() is not None:
-        with console.working("Finding the exact optimum (solved once, then cached)"):
+        with console.working("Finding the exact optimum"):
             optimum = curve_optimum(run.population)
     with console.bar("compiling", budget.amount) as update:
         run.train(budget, [RunProgress(run, optimum, update, show)])

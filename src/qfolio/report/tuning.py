@@ -134,7 +134,7 @@ def _finals(data: Sweep) -> list[tuple[str, list[str]]]:
             continue
         digits = decimals(optimum or returns.mean())
         spread = over_seeds(returns, mean_interval(returns), partial(number, digits=digits))
-        missed = "–" if optimum is None else percent(float(regret(returns.mean(), optimum)), 1)
+        missed = "–" if not optimum else percent(float(regret(returns.mean(), optimum)), 1)
         cells = [number(returns.mean(), digits), spread, number(returns.min(), digits), missed]
         rows.append((name, cells))
     return rows
