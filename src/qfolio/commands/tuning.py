@@ -220,7 +220,7 @@ def _conclude(work: "Tuning", resume: str, executor: "Executor") -> Document:
         data = sweep(work, summary, f"{train}\n{resume}")
         write_tuning_report(work.folder, data)
     print_search(summary, data.verdicts)
-    say(f"\nTrain the best configuration with:\n{train}")
+    say(f"\nThis trains the best configuration of the search:\n{train}")
     say(f"Report: {work.folder / PAGE}")
     return summary
 
