@@ -3,9 +3,9 @@
 import msgspec
 import numpy as np
 
+from qfolio.portfolio.study.evidence import TableReturns
 from qfolio.portfolio.study.folder import Look, Result, StudyConfig, TableConfig, Variant
-from qfolio.portfolio.study.pooling import TableReturns
-from qfolio.portfolio.study.run import summarize
+from qfolio.portfolio.study.result import summarize
 
 from tables import weekdays
 

@@ -23,7 +23,7 @@ from qfolio.portfolio.backtest.statistics.assessment import (
 from qfolio.portfolio.backtest.statistics.measures import MEASURES
 from qfolio.portfolio.backtest.statistics.sharpe import SharpeTest
 from qfolio.portfolio.desk.follow import COLUMNS
-from qfolio.portfolio.study.pooling import Active, Evidence
+from qfolio.portfolio.study.evidence import Active, Evidence
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = "\n".join(page.read_text() for page in sorted((DOCS / "reference").glob("*.md")))

@@ -14,8 +14,9 @@ import msgspec
 from qfolio.core.files import write_text
 from qfolio.core.text import amount, listed
 from qfolio.portfolio.backtest.statistics.verdict import p_text
+from qfolio.portfolio.study.evidence import Active, Evidence
 from qfolio.portfolio.study.folder import Result, StudyConfig, StudyFolder, Variant
-from qfolio.portfolio.study.pooling import Active, Evidence, Pools
+from qfolio.portfolio.study.pooling import Pools
 from qfolio.portfolio.study.run import Study
 from qfolio.portfolio.study.verdict import decimal, looks_sentence, percent
 from qfolio.report import rendering

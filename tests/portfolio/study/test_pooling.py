@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 
 from qfolio.portfolio.backtest.statistics.estimates import estimate
+from qfolio.portfolio.study.evidence import TableReturns, evidence, z_of
 from qfolio.portfolio.study.pooling import (
-    TableReturns,
     correlations,
-    evidence,
     hierarchical_bootstrap,
     p_value,
     pool,
     stouffer,
-    z_of,
 )
 
 from studies import made_up

@@ -1,6 +1,7 @@
 import pytest
 
-from qfolio.portfolio.study.pooling import Active, Evidence, Pooled, PooledSharpe, Pools
+from qfolio.portfolio.study.evidence import Active, Evidence
+from qfolio.portfolio.study.pooling import Pooled, PooledSharpe, Pools
 from qfolio.portfolio.study.verdict import verdicts
 
 ACTIVE = {"growth": 0.01, "low": 0.0, "high": 0.02, "tracking_error": 0.02, "t": 1.0, "z": 1.0}

@@ -6,8 +6,9 @@ from qfolio.commands.console import print_table, say, tell
 from qfolio.core.text import amount, figure
 
 if TYPE_CHECKING:
+    from qfolio.portfolio.study.evidence import Active
     from qfolio.portfolio.study.folder import Result, Variant
-    from qfolio.portfolio.study.pooling import Active, Pooled
+    from qfolio.portfolio.study.pooling import Pooled
     from qfolio.portfolio.study.run import Study
 
 

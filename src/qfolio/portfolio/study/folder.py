@@ -17,7 +17,8 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json, write_csv
 from qfolio.core.text import shell
 from qfolio.portfolio.backtest.folder import RISK_FREE, BacktestFolder, followed
-from qfolio.portfolio.study.pooling import Pools, TableReturns
+from qfolio.portfolio.study.evidence import TableReturns
+from qfolio.portfolio.study.pooling import Pools
 
 FILE = "study.json"
 

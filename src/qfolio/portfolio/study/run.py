@@ -28,7 +28,6 @@ from qfolio.core.errors import (
 from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
-from qfolio.core.statistics import holm
 from qfolio.core.text import amount, near, shell
 from qfolio.experiments.executor import Executor
 from qfolio.experiments.interrupts import interruptible
@@ -43,10 +42,8 @@ from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
-from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
-from qfolio.portfolio.backtest.statistics.sharpe import expected_maximum_sharpe
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
-from qfolio.portfolio.prices.table import Prices, describe, load, trials_on
+from qfolio.portfolio.prices.table import Prices, describe, load
 from qfolio.portfolio.study.folder import (
     NAME,
     Look,
@@ -55,11 +52,10 @@ from qfolio.portfolio.study.folder import (
     StudyFolder,
     TableConfig,
     Variant,
-    VariantResult,
 )
-from qfolio.portfolio.study.pooling import AGAINST, Finding, Pooled, Pools, TableReturns, pool
+from qfolio.portfolio.study.result import summarize
 from qfolio.portfolio.study.training import Listen, Trainings, of_table
-from qfolio.portfolio.study.verdict import decimal, percent, verdicts
+from qfolio.portfolio.study.verdict import decimal, percent
 
 Report = Callable[[Backtest, dict[str, Entry], Assessment, list[str], Why | None], None]
 
@@ -343,63 +339,10 @@ class Study:
         self._files.write(self.config)
 
 
-def summarize(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]]) -> Result:
-    """Pool the evidence of a study.
-
-    Args:
-        config: With the looks that were taken.
-        tested: The returns on each table, by variant.
-    """
-    pooled = [pool(tables, config.agents) for tables in tested]
-    rebalanced = any(len(table.rebalancings) > 1 for table in tested[0].values())
-    before = [table.trials + trials_on(table.source) for table in config.tables.values()]
-    trials = max(before) + len(config.variants) * len(config.agents)
-    threshold = expected_maximum_sharpe(trials, 1.0)
-    pooled[0] = corrected(pooled[0], rebalanced, threshold)
-    return Result(
-        variants=[
-            VariantResult(variant=variant, agents=agents)
-            for variant, agents in zip(config.variants, pooled, strict=True)
-        ],
-        looks=sum(len(look.agents) for look in config.looks),
-        earlier=sum(before),
-        trials=trials,
-        threshold=threshold,
-        verdicts=verdicts(pooled[0], threshold),
-    )
-
-
 def looks_of(folder: Path | str) -> list[Look]:
     """All looks that a study knows of: earlier ones and its own."""
     config = StudyFolder(Path(folder)).read()
     return [*config.earlier, *config.looks]
-
-
-def corrected(
-    agents: Mapping[str, Pools], rebalanced: bool, threshold: float = 0.0
-) -> dict[str, Pools]:
-    """The pooled evidence with findings, by Holm's correction over all agents and references.
-
-    rebalanced: whether the reference has rebalancings; if not, there is one comparison per agent.
-    threshold: the z that luck is expected to reach after all looks; nothing below it is better.
-    """
-    against = AGAINST if rebalanced else AGAINST[:1]
-    pooled: list[Pooled] = [getattr(agents[name], key) for name in agents for key in against]
-    p_holm = holm([1.0 if each.p is None else each.p for each in pooled]).tolist()
-    found = iter([_found(each, p, threshold) for each, p in zip(pooled, p_holm, strict=True)])
-    decided = {}
-    for name, pools in agents.items():
-        first = next(found)
-        second = next(found) if rebalanced else first
-        decided[name] = msgspec.structs.replace(pools, to_reference=first, to_rebalanced=second)
-    return decided
-
-
-def _found(pooled: Pooled, p: float, threshold: float) -> Pooled:
-    finding: Finding = "none"
-    if p <= 1 - LEVEL and pooled.z is not None and not 0 < pooled.z < threshold:
-        finding = "better" if pooled.z > 0 else "worse"
-    return msgspec.structs.replace(pooled, p_holm=p, finding=finding)
 
 
 def _table_config(prices: Prices, trials: int) -> TableConfig:
