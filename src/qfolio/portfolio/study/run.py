@@ -129,9 +129,11 @@ class Study:
         costs = _charged(costs, options)
         variants = [Variant(int(lag), float(cost)) for lag, cost in itertools.product(lags, costs)]
         _require_plan(tables, variants)
-        earlier = list(dict.fromkeys(look for folder in after for look in looks_of(folder)))
+        studies = [StudyFolder(Path(folder)).read() for folder in after]
+        looked = (look for study in studies for look in (*study.earlier, *study.looks))
+        earlier = list(dict.fromkeys(looked))
         looks = {
-            name: int(trials) + _told(after, table.digest) + _count(earlier, table.digest)
+            name: int(trials) + _told(studies, table.digest) + _count(earlier, table.digest)
             for name, table in tables.items()
         }
         left_out = {}
@@ -339,12 +341,6 @@ class Study:
         self._files.write(self.config)
 
 
-def looks_of(folder: Path | str) -> list[Look]:
-    """All looks that a study knows of: earlier ones and its own."""
-    config = StudyFolder(Path(folder)).read()
-    return [*config.earlier, *config.looks]
-
-
 def _table_config(prices: Prices, trials: int) -> TableConfig:
     facts = describe(prices)
     kept = {key: facts[key] for key in ("source", "digest", "rows", "assets", "first", "last")}
@@ -355,12 +351,11 @@ def _count(looks: Sequence[Look], digest: str) -> int:
     return sum(len(look.agents) for look in looks if look.digest == digest)
 
 
-def _told(folders: Sequence[Path | str], digest: str) -> int:
+def _told(studies: Sequence[StudyConfig], digest: str) -> int:
     """The looks at a table that earlier studies were told of by ``trials``.
 
     Several may have been told of the same ones, so the largest number counts.
     """
-    studies = [StudyFolder(Path(folder)).read() for folder in folders]
     told = (
         table.trials - _count(study.earlier, digest)
         for study in studies
