@@ -70,6 +70,9 @@ def make_data(
             "test": "6m",
             "expanding": False,
             "cap": 0.3,
+            "cost_model": "proportional",
+            "calendar": "",
+            "mandate": None,
             "agents": {"DQN": {"settings": {"discount": 0.98}}},
         },
         folds=[
@@ -82,6 +85,9 @@ def make_data(
             }
         ],
         notes=[],
+        moves=np.zeros((len(dates), len(assets))),
+        risk_free=np.zeros(len(dates)),
+        begin=dates[0] - min(np.timedelta64(1, "D"), dates[1] - dates[0]),
     )
     return replace(data, **more)
 

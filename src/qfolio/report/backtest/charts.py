@@ -66,7 +66,7 @@ def _rolling(
     """Rolling Sharpe ratio and beta to the reference, means over the seeds, as they are shown."""
     returns, year = data.strategies[name].returns, data.assessment.periods_per_year
     reference = data.strategies[data.assessment.reference].returns[0]
-    excess = returns if data.risk_free is None else returns - data.risk_free
+    excess = returns - data.risk_free
     both = rolling_sharpe(excess, window, year), rolling_beta(returns, reference, window)
     sharpe, beta = (np.append(np.nan, values.mean(axis=0)[ends]).round(2) for values in both)
     return {"sharpe": compact(sharpe), "beta": compact(beta)}

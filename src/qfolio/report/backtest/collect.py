@@ -65,12 +65,12 @@ def backtest_data(
             for fold in backtest.folds
         ],
         notes=list(notes),
-        training={name: folds for name in backtest.agents if (folds := _training(backtest, name))},
-        why=why,
         moves=backtest.replay.growth[:, 1:] - 1,
-        capacity=capacity(backtest.replay, entries, assessment.reference),
         risk_free=backtest.replay.growth[:, 0] - 1,
         begin=backtest.prices.dates[backtest.replay.rows[0]],
+        training={name: folds for name in backtest.agents if (folds := _training(backtest, name))},
+        why=why,
+        capacity=capacity(backtest.replay, entries, assessment.reference),
     )
 
 

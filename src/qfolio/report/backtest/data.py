@@ -61,17 +61,16 @@ class BacktestData:
             digest; where they are known, also late_assets and delisted_assets (numbers of those
             that start or end within the table), haircut (the share of a holding that is lost when
             its asset ends) and has_members.
-        config: All settings, a nested dictionary. If it has cost (one way, a fraction), lag (in
-            rows), cap, train, test (lengths) and expanding, the page also says them in words.
-        folds: For each fold name, train_first, train_last, test_first and test_last (ISO dates).
+        config: All settings of the backtest but prices and assets, a nested dictionary.
+        folds: For each fold name, train_first, train_last, test_first and test_last (ISO dates); at
+            least one.
         notes: Problems of the backtest, in sentences.
+        moves: Simple returns of the assets on these days, shape (D, N), 0 before an asset's start.
+        risk_free: Simple returns of cash on these days, shape (D,).
+        begin: The date of the first trade, from which the first return was earned.
         training: The training of each fold, by agent; empty if records are missing.
         why: The attribution of the agents' returns; without it, the page has no such section.
-        moves: Simple returns of the assets on these days, shape (D, N), 0 before an asset's start;
-            without them, the page does not say what each asset contributed.
         capacity: Growth by capital, if costs depend on it.
-        risk_free: Simple returns of cash on these days, shape (D,) (default: 0).
-        begin: The date of the first trade, from which the first return was earned.
     """
 
     title: str
@@ -84,20 +83,17 @@ class BacktestData:
     config: dict[str, Any]
     folds: list[dict[str, Any]]
     notes: list[str]
+    moves: Floats
+    risk_free: Floats
+    begin: np.datetime64
     training: dict[str, list[FoldTraining]] = field(default_factory=dict)
     why: Why | None = None
-    moves: Floats | None = None
     capacity: Capacity | None = None
-    risk_free: Floats | None = None
-    begin: np.datetime64 | None = None
 
     @property
     def trades(self) -> NDArray[np.datetime64]:
         """The dates of the trades before each return, shape (D,)."""
-        begin = self.begin
-        if begin is None:  # a day before the first return, or less if rows are closer
-            begin = self.dates[0] - min(np.timedelta64(1, "D"), *np.diff(self.dates[:2]))
-        return np.append(begin, self.dates[:-1])
+        return np.append(self.begin, self.dates[:-1])
 
 
 def require_fit(data: BacktestData) -> None:
@@ -115,7 +111,7 @@ def require_fit(data: BacktestData) -> None:
             raise QfolioError(
                 f"The series of {name} do not fit {days[0]} dates and {len(data.assets)} assets."
             )
-    if data.moves is not None and data.moves.shape != (*days, len(data.assets)):
+    if data.moves.shape != (*days, len(data.assets)):
         raise QfolioError(
             f"The assets' returns do not fit {days[0]} dates and {len(data.assets)} assets."
         )

@@ -8,6 +8,7 @@ from typing import Any
 from qfolio.core.statistics import FEWEST_SEEDS
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
+from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL
 from qfolio.portfolio.calendars import PERIODS, band
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import THIN_SPACE, number
@@ -17,19 +18,16 @@ def key_facts(data: BacktestData) -> list[str]:
     """The test's dates, assets, costs and other key facts, in a few words each."""
     test, settings, unit = data.assessment, data.config, unit_of(data.assessment.periods_per_year)
     years = number(test.periods / test.periods_per_year)
-    facts = [
+    return [
         str(data.prices["source"]),
         f"{test.first_date} to {test.last_date} ({years} years)",
         f"{amount(len(data.assets), 'asset')} and cash",
         *_universe(data.prices),
+        f"{basis_points(settings['cost'])} of the value traded",
+        f"lag of {amount(settings['lag'], unit)}",
+        amount(len(data.folds), "fold"),
+        amount(test.trials, "trial"),
     ]
-    if "cost" in settings:
-        facts.append(f"{basis_points(settings['cost'])} of the value traded")
-    if "lag" in settings:
-        facts.append(f"lag of {amount(settings['lag'], unit)}")
-    if data.folds:
-        facts.append(amount(len(data.folds), "fold"))
-    return [*facts, amount(test.trials, "trial")]
 
 
 def _universe(prices: dict[str, Any]) -> list[str]:
@@ -97,19 +95,15 @@ def few_seeds(test: Assessment) -> bool:
     return 1 < max(seeds, default=1) < FEWEST_SEEDS
 
 
-PLAIN = (None, "proportional")
-"""Cost models that the proportional cost describes."""
-
-
 def account(data: BacktestData) -> dict[str, Any]:
-    """Return the settings that describe the test; None for those that are unknown."""
+    """Return the settings that describe the test; a model only if the costs need its name."""
     test, settings = data.assessment, data.config
     return {
-        "cost": basis_points(settings["cost"]) if "cost" in settings else None,
-        **{key: settings.get(key) for key in ("lag", "train", "test", "expanding", "cap")},
-        "mandate": "; ".join(_limits(settings.get("mandate") or {})),
-        "model": None if settings.get("cost_model") in PLAIN else settings["cost_model"],
-        "calendar": _calendar(settings.get("calendar") or "", unit_of(test.periods_per_year)),
+        "cost": basis_points(settings["cost"]),
+        **{key: settings[key] for key in ("lag", "train", "test", "expanding", "cap")},
+        "mandate": "; ".join(_limits(settings["mandate"] or {})),
+        "model": None if settings["cost_model"] == PROPORTIONAL else settings["cost_model"],
+        "calendar": _calendar(settings["calendar"], unit_of(test.periods_per_year)),
         "long_only": _long_only(data),
         "universe": " ".join(universe(data.prices)),
         "trials": _counts(test),
@@ -119,7 +113,7 @@ def account(data: BacktestData) -> dict[str, Any]:
 
 def _long_only(data: BacktestData) -> bool:
     """Whether nobody may, and nobody does, sell short or borrow."""
-    mandate = data.config.get("mandate") or {}
+    mandate = data.config["mandate"] or {}
     floor = mandate.get("assets", {}).get("floor")
     floors = list(floor.values()) if isinstance(floor, dict) else [floor]
     least = [*floors, mandate.get("cash", {}).get("min")]

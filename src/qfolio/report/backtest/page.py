@@ -133,7 +133,7 @@ def render_backtest(data: BacktestData) -> str:
         rebalancings=rebalancing_rows(data),
         cost_kinds=cost_kinds(data),
         costs=cost_rows(lead, data),
-        cash_earns=data.risk_free is not None and bool(data.risk_free.any()),
+        cash_earns=bool(data.risk_free.any()),
         dearer=dearer_table(data),
         capacity=capacity_table(data),
         luck=luck_rows(lead, data),

@@ -15,8 +15,9 @@ from qfolio.portfolio.backtest.statistics.estimates import MEASURED, Measured
 from qfolio.portfolio.backtest.statistics.measures import growth_at, monthly
 from qfolio.portfolio.backtest.statistics.sampled import Measure
 from qfolio.portfolio.backtest.statistics.verdict import comparable, luck, shown, telling, wiped_out
+from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL
 from qfolio.report.backtest.data import BacktestData, main_names
-from qfolio.report.backtest.facts import PLAIN, basis_points
+from qfolio.report.backtest.facts import basis_points
 from qfolio.report.rendering import number, percent, place
 
 HEADINGS = {
@@ -216,8 +217,8 @@ def cost_rows(names: list[str], data: BacktestData) -> list[tuple[str, list[str]
 
 def dearer_table(data: BacktestData) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """Multiples of the costs as headings, and growth at each; no rows if nothing costs anything."""
-    one = data.config.get("cost", 0.0)
-    plain = one > 0 and data.config.get("cost_model") in PLAIN
+    one = data.config["cost"]
+    plain = one > 0 and data.config["cost_model"] == PROPORTIONAL
     headings = [basis_points(k * one) if plain else f"{k:g} ×" for k in MULTIPLES]
     year = data.assessment.periods_per_year
     rows = [
@@ -303,8 +304,6 @@ def month_tables(names: list[str], data: BacktestData) -> list[tuple[str, list[_
 
 def fold_rows(folds: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the folds with start and length of their windows, in % of the whole span."""
-    if not folds:
-        return []
     keys = ("train_first", "train_last", "test_first", "test_last")
     days = np.array([[fold[key] for key in keys] for fold in folds], dtype="datetime64[s]")
     days = days.astype(float)

@@ -61,8 +61,7 @@ def tear_sheet(names: list[str], data: BacktestData) -> dict[str, Any]:
 
 def _means(name: str, data: BacktestData, year: float) -> dict[str, float]:
     """Figures of a strategy; ratios over what cash earns are those of its assessment."""
-    series, test = data.strategies[name], data.assessment
-    cash = 0.0 if data.risk_free is None else data.risk_free
+    series, test, cash = data.strategies[name], data.assessment, data.risk_free
     reference = data.strategies[test.reference].returns.mean(axis=0) - cash
     each = [
         {**figures(row, data.dates, year), "alpha": alpha(row - cash, reference, year)}
@@ -229,8 +228,6 @@ def _histogram(
 
 def _assets(series: StrategySeries, data: BacktestData, year: float) -> list[dict[str, Any]]:
     """Contributions to the mean return per year, largest first, then the rest and the sum."""
-    if data.moves is None:
-        return []
     parts, rest = contributions(series.returns, series.weights, data.moves, year)
     order = np.argsort(-np.abs(parts), kind="stable").tolist()
     count = LISTED if len(order) > LISTED + 1 else len(order)
