@@ -40,12 +40,6 @@ def render(template: str, **context: Any) -> str:
     return environment.get_template(template).render(palette=palette, **context)
 
 
-def place(value: float, low: float, high: float) -> float:
-    """Return the position of a value on an axis, in percent; beyond its ends, that of the end."""
-    share = (value - low) / (high - low) if high > low else 0.5
-    return round(100 * min(max(share, 0.0), 1.0), 2)
-
-
 def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
     """Return a number with a typographic minus sign and commas between thousands."""
     if math.isinf(value):

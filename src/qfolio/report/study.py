@@ -6,7 +6,6 @@ All of its numbers are in study.json, so the report can be rewritten from it.
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
@@ -20,8 +19,8 @@ from qfolio.portfolio.study.pooling import Pools
 from qfolio.portfolio.study.run import Study
 from qfolio.portfolio.study.verdict import decimal, looks_sentence, percent
 from qfolio.report import rendering
-from qfolio.report.backtest.verdicts import ticks_around
-from qfolio.report.rendering import THIN_SPACE, counted, number, place, render, setting_groups
+from qfolio.report.axis import Axis, ticks_around
+from qfolio.report.rendering import THIN_SPACE, counted, number, render, setting_groups
 
 REACH = 1.6
 """The axis extends this many times beyond the estimates; longer intervals are cut off."""
@@ -145,14 +144,12 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
     low = max(min([*points, *ends]), REACH * min(points) - 0.25 * max(points))
     high = min(max([*points, *ends]), REACH * max(points) - 0.25 * min(points))
     ticks, digits = ticks_around(low, high)
-    low, high = min(low, ticks[0]), max(high, ticks[-1])
-    at = partial(place, low=low, high=high)
+    axis = Axis(min(low, ticks[0]), max(high, ticks[-1]))
 
     def bar(growth: float | None, left: float | None, right: float | None) -> Bar | None:
         if growth is None or left is None or right is None:
             return None
-        width = round(at(right) - at(left), 2)
-        return Bar(at(left), width, at(growth), left < low, right > high)
+        return Bar(*axis.span(growth, (left, right)), left < axis.low, right > axis.high)
 
     longest = max(known.years for known in pools.evidence.values())
     order = sorted(actives, key=lambda name: _or(actives[name].growth), reverse=True)
@@ -188,9 +185,9 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
             ],
             "label": _label(pooled.growth, pooled.low, pooled.high),
         },
-        "ticks": [(rendering.percent(tick, digits, sign=True), at(tick)) for tick in ticks],
-        "zero": at(0.0),
-        "mean": None if pooled.growth is None else at(pooled.growth),
+        "ticks": [(rendering.percent(tick, digits, sign=True), axis.at(tick)) for tick in ticks],
+        "zero": axis.at(0.0),
+        "mean": None if pooled.growth is None else axis.at(pooled.growth),
         "cut": any(row.bar and (row.bar.cut_left or row.bar.cut_right) for row in rows),
     }
 

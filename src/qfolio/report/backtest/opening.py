@@ -6,7 +6,6 @@ All of it compares an agent with one other strategy: the one of its first verdic
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any, Literal
 
 from qfolio.core.text import listed
@@ -14,9 +13,9 @@ from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment
 from qfolio.portfolio.backtest.statistics.differences import Difference
 from qfolio.portfolio.backtest.statistics.estimates import Measured
 from qfolio.portfolio.backtest.statistics.verdict import claims, comparable, wiped_out
+from qfolio.report.axis import Axis, ticks_around
 from qfolio.report.backtest.data import BacktestData, followed_names, shown_order
-from qfolio.report.backtest.verdicts import ticks_around
-from qfolio.report.rendering import number, percent, place
+from qfolio.report.rendering import number, percent
 
 Standing = Literal["better", "none", "worse", "ruined"]
 
@@ -242,8 +241,7 @@ def _column(key: Measured, names: list[str], data: BacktestData) -> dict[str, An
         for end in (each.value, *each.interval)
     ]
     ticks, _ = ticks_around(min(ends, default=0.0), max(ends, default=0.0))
-    low, high = min(*ends, *ticks, 0.0), max(*ends, *ticks, 0.0)
-    at = partial(place, low=low, high=high)
+    axis = Axis(min(*ends, *ticks, 0.0), max(*ends, *ticks, 0.0))
 
     def written(value: float) -> str:
         return number(value, 2, sign=True) if key == "sharpe" else percent(value, sign=True)
@@ -260,9 +258,9 @@ def _column(key: Measured, names: list[str], data: BacktestData) -> dict[str, An
                 **cell,
                 "apart": verdict == "none" and not left <= 0 <= right,
                 "value": written(contrast.value),
-                "span": (at(left), round(at(right) - at(left), 2), at(contrast.value)),
+                "span": axis.span(contrast.value, contrast.interval),
                 "label": f"{written(contrast.value)}, 95% interval "
                 f"{written(left)} to {written(right)}",
             }
         )
-    return {"cells": cells, "zero": at(0.0)}
+    return {"cells": cells, "zero": axis.at(0.0)}

@@ -16,9 +16,10 @@ from qfolio.portfolio.backtest.statistics.measures import growth_at, monthly
 from qfolio.portfolio.backtest.statistics.sampled import Measure
 from qfolio.portfolio.backtest.statistics.verdict import comparable, luck, shown, telling, wiped_out
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL
+from qfolio.report.axis import Axis
 from qfolio.report.backtest.data import BacktestData, main_names
 from qfolio.report.backtest.facts import basis_points
-from qfolio.report.rendering import number, percent, place
+from qfolio.report.rendering import number, percent
 
 HEADINGS = {
     "growth": "Growth",
@@ -108,9 +109,7 @@ def _interval(
     ends = [end for each in column for end in each.over_time if math.isfinite(end)]
     if not ends or not all(map(math.isfinite, (value, *interval))):
         return None
-    at = partial(place, low=min(ends), high=max(ends))
-    left, right = map(at, interval)
-    return left, round(right - left, 2), at(value)
+    return Axis(min(ends), max(ends)).span(value, interval)
 
 
 def _over_seeds(measure: Measure) -> tuple[float, ...]:

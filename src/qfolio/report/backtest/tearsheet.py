@@ -18,10 +18,11 @@ from qfolio.portfolio.backtest.statistics.tearsheet import (
     figures,
     leverage,
 )
+from qfolio.report.axis import Axis
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.backtest.facts import unit_of
 from qfolio.report.backtest.why import bars
-from qfolio.report.rendering import number, percent, place
+from qfolio.report.rendering import number, percent
 
 DRAWDOWNS = 5
 """Number of drawdowns listed."""
@@ -209,7 +210,7 @@ def _histogram(
         for x in (i * width, (i + 1) * width)
     ]
     reach = float(edges[-1])
-    at = partial(place, low=-reach, high=reach)
+    axis = Axis(-reach, reach)
     var, cvar = found["var"], found["cvar"]
     return {
         "bars": [
@@ -220,7 +221,7 @@ def _histogram(
         "outline": " ".join(steps),
         "reach": percent(reach),
         "highest": percent(highest / 100, 0),
-        "marks": [(at(-cvar), "CVaR"), (at(-var), "VaR")],
+        "marks": [(axis.at(-cvar), "CVaR"), (axis.at(-var), "VaR")],
         "label": f"95% of the returns are above {percent(-var, 2)}; "
         f"the mean of the others is {percent(-cvar, 2)}",
     }

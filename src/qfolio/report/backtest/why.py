@@ -7,7 +7,6 @@ stand beside them as text.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,9 @@ from qfolio.portfolio.backtest.attribution.factors import Exposures
 from qfolio.portfolio.backtest.attribution.importance import Worth
 from qfolio.portfolio.backtest.attribution.slices import Slice, Slices
 from qfolio.portfolio.backtest.attribution.why import AgentWhy
+from qfolio.report.axis import Axis
 from qfolio.report.backtest.data import BacktestData
-from qfolio.report.rendering import number, percent, place
+from qfolio.report.rendering import number, percent
 
 LISTED = 20
 """Number of assets, besides cash, whose parts of the return are listed; the rest is added up."""
@@ -280,19 +280,18 @@ def bars(
 ) -> list[dict[str, Any]]:
     """Positions of bars from a common zero, in percent of their track."""
     ends = [*values, *(end for pair in whiskers for end in pair), 0.0]
-    at = partial(place, low=min(ends), high=max(ends))
+    axis = Axis(min(ends), max(ends))
     found = []
     for i, value in enumerate(values):
-        left, right = sorted((at(0), at(value)))
+        left, right = sorted((axis.at(0), axis.at(value)))
         bar: dict[str, Any] = {
             "left": left,
             "width": round(right - left, 2),
-            "zero": at(0),
+            "zero": axis.at(0),
             "side": "gain" if value >= 0 else "loss",
             "whisker": None,
         }
         if whiskers:
-            ends_of = [at(end) for end in whiskers[i]]
-            bar["whisker"] = (ends_of[0], round(ends_of[1] - ends_of[0], 2))
+            bar["whisker"] = axis.span(value, whiskers[i])[:2]
         found.append(bar)
     return found
