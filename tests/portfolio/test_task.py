@@ -15,7 +15,7 @@ from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.costs import drift
 from qfolio.portfolio.following import begin, follow
-from qfolio.portfolio.market import Menu, Signalled
+from qfolio.portfolio.menu import Menu, Signalled
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 

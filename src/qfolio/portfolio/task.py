@@ -42,7 +42,8 @@ from qfolio.portfolio.mandate.limits import (
 )
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.mandate.risk import Past, Risk, covariances
-from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
+from qfolio.portfolio.market import Contexts, Holding, Market, Relatives
+from qfolio.portfolio.menu import Signalled
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.universe import Patterns
 

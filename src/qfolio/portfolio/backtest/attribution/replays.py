@@ -21,7 +21,8 @@ from qfolio.core.mdp import Agent
 from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.following import begin, paths
-from qfolio.portfolio.market import Holding, Signalled
+from qfolio.portfolio.market import Holding
+from qfolio.portfolio.menu import Signalled
 from qfolio.portfolio.task import Portfolio
 
 AT_ONCE = 16
