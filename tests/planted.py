@@ -1,6 +1,5 @@
 """A market with planted momentum, and agents whose drivers are known."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -92,10 +91,9 @@ def four_folds(prices, **changed):
     settings = {"signals": SIGNALS, "window": 2, "horizon": 20, "cost": 0.0005, **changed}
     task = Portfolio.of(prices, **settings)
     folds = walk_forward(prices.dates, "200d", "150d", 1)
-    where = lambda t: (t.center, t.scale)  # noqa: E731
-    plain = jnp.zeros_like(task.center), jnp.ones_like(task.scale)
+    plain = {"center": jnp.zeros_like(task.center), "scale": jnp.ones_like(task.scale)}
     parts = (task.part(fold.train.start, fold.train.stop - 1) for fold in folds)
     return [
-        Stretch(eqx.tree_at(where, part, plain), jnp.array([0.4, 0.6]), fold)
+        Stretch(part.having(**plain), jnp.array([0.4, 0.6]), fold)
         for part, fold in zip(parts, folds, strict=True)
     ]

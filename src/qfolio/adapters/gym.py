@@ -9,7 +9,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -107,8 +106,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             ):
                 raise QfolioError("scaled_by must have the assets and features of prices.")
             scale = Portfolio.of(other, **{**chosen, "horizon": 1})  # whatever its length
-            where = lambda task: (task.center, task.scale)  # noqa: E731
-            self.task = eqx.tree_at(where, self.task, where(scale))
+            self.task = self.task.having(center=scale.center, scale=scale.scale)
         assets, channels = len(self.prices.assets), self.task.center.shape[0]
         self.first = int(self.task.first_decision)
         self.last = int(self.task.last_decision) - self.task.horizon + 1

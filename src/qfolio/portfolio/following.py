@@ -23,9 +23,8 @@ TOLERANCE = 1e-4
 
 def on_table(task: Portfolio, prices: Prices) -> Portfolio:
     """The same task over all rows of another table, with the scale of its training data."""
-    rows = jnp.array(task.window, jnp.int32), jnp.array(len(prices) - 1, jnp.int32)
-    where = lambda t: (t.first_decision, t.last_decision)  # noqa: E731
-    return eqx.tree_at(where, task.on(prices), rows)
+    first, last = jnp.array(task.window, jnp.int32), jnp.array(len(prices) - 1, jnp.int32)
+    return task.on(prices).having(first_decision=first, last_decision=last)
 
 
 def follow(

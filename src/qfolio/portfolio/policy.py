@@ -350,11 +350,7 @@ class Policy:
 
     def _moved(self, table: Prices) -> Portfolio:
         """The task on all rows of another table, with the scale of the old one."""
-        task = on_table(self.task, table)
-        tradable = ~np.isnan(table.values[0]) if table.tradable is None else None
-        part = task.part(0, len(table) - 1, tradable)
-        where = lambda t: (t.center, t.scale)  # noqa: E731
-        return eqx.tree_at(where, part, where(self.task))
+        return self.task.on_all(table).having(center=self.task.center, scale=self.task.scale)
 
 
 def _slowed(agent: Agent) -> Agent:

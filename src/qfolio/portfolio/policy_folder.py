@@ -8,7 +8,6 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import msgspec
@@ -123,14 +122,10 @@ def _blank(config: PolicyConfig) -> Portfolio:
     """The task without its prices."""
     chosen = settings.convert(Portfolio, config.task)
     task = Portfolio.blank(len(config.assets), len(config.features), **chosen)
-    rows = (task.log_relatives, task.extra, task.anchors, task.benchmarks)
-    shown = jax.tree.map(lambda x: jnp.zeros((task.window, *x.shape[1:])), rows)
-    last = jnp.array(config.rows - task.lag - 2, jnp.int32)
-    return eqx.tree_at(
-        lambda t: (
-            t.log_relatives, t.extra, t.anchors, t.benchmarks, t.first_decision, t.last_decision,
-            t.year,
-        ),
-        task,
-        (*shown, jnp.array(task.window, jnp.int32), last, jnp.array(config.periods_per_year)),
-    )  # fmt: skip
+    windows = ("log_relatives", "extra", "anchors", "benchmarks")
+    return task.having(
+        **{name: jnp.zeros((task.window, *getattr(task, name).shape[1:])) for name in windows},
+        first_decision=jnp.array(task.window, jnp.int32),
+        last_decision=jnp.array(config.rows - task.lag - 2, jnp.int32),
+        year=jnp.array(config.periods_per_year),
+    )

@@ -102,8 +102,7 @@ class Portfolio(Market):
         if "mandate" in settings:
             settings["mandate"] = mandate_text(settings["mandate"], prices.assets)
         task = Portfolio.blank(len(prices.assets), len(prices.feature_names), **settings)
-        first = ~np.isnan(prices.values[0]) if prices.tradable is None else None
-        return task.on(prices).part(0, len(prices) - 1, first)
+        return task.on_all(prices)
 
     @staticmethod
     def blank(assets: int, features: int, **settings: Any) -> "Portfolio":
@@ -129,6 +128,11 @@ class Portfolio(Market):
             allowed=_allowed(settings.get("mandate", ""), np.ones(assets, bool), 1.0),
             **settings,
         )
+
+    def on_all(self, prices: Prices) -> "Portfolio":
+        """The same task on all rows of a table, with the scale of its observations."""
+        first = ~np.isnan(prices.values[0]) if prices.tradable is None else None
+        return self.on(prices).part(0, len(prices) - 1, first)
 
     def on(self, prices: Prices) -> "Portfolio":
         """The same task on another table, otherwise unchanged."""
@@ -156,29 +160,36 @@ class Portfolio(Market):
         estimated = np.zeros((0, *self.covariances.shape[1:]))
         if self.allowed is not None and self.allowed.limits_risk:
             estimated = covariances(logs, prices.first_rows, risk.rows, year)
-        given = (logs, extra, followed, then, passed, compared, estimated, year)
-        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), given)
         decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)
         decides[-1:] = True  # tomorrow's weights may be asked for on any day
         tradable, patterns = prices.tradable, None
         joined = prices.first_rows.astype(np.int32)
         if tradable is not None and self.mandate:
             patterns = Patterns.of(self.mandate, tradable, self.max_weight)[0].in_float32()
+        numbers = {
+            "log_relatives": logs, "extra": extra, "anchors": followed, "conditions": then,
+            "elapsed": passed, "benchmarks": compared, "covariances": estimated, "year": year,
+        }  # fmt: skip
+        others = {
+            "joined": joined, "decides": decides, "tradable": tradable, "patterns": patterns,
+        }  # fmt: skip
+        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), numbers)
+        return self.having(**arrays, **jax.tree.map(jnp.asarray, others))
+
+    def having(self, **arrays: Any) -> "Portfolio":
+        """The same task with other arrays in some fields, which are not checked."""
         return eqx.tree_at(
-            lambda t: (
-                t.log_relatives, t.extra, t.anchors, t.conditions, t.elapsed, t.benchmarks,
-                t.covariances, t.year, t.joined, t.decides, t.tradable, t.patterns,
-            ),
+            lambda task: [getattr(task, name) for name in arrays],
             self,
-            (*arrays, *jax.tree.map(jnp.asarray, (joined, decides, tradable, patterns))),
+            list(arrays.values()),
             is_leaf=lambda x: x is None,
-        )  # fmt: skip
+        )
 
     def deciding_at(self, row: int) -> "Portfolio":
         """The same task with a decision at a row, whatever the calendar says."""
         if not self.calendar:
             return self
-        return eqx.tree_at(lambda t: t.decides, self, self.decides.at[row].set(True))
+        return self.having(decides=self.decides.at[row].set(True))
 
     def __check_init__(self) -> None:
         require(self, "window horizon", lambda x: 1 <= x <= 100_000, "from 1 to 100,000")
@@ -237,18 +248,14 @@ class Portfolio(Market):
         allowed = _allowed(self.mandate, usable, self.max_weight)
         if allowed is not None:
             limits = np.maximum(allowed.limits.high, 0.0)
-        part = eqx.tree_at(
-            lambda t: (t.limits, t.center, t.scale, t.first_decision, t.last_decision),
-            self,
-            (
-                jnp.asarray(limits, jnp.float32),
-                jnp.asarray(np.nan_to_num(center), jnp.float32),
-                jnp.asarray(np.where(scale > 0, scale, 1.0), jnp.float32),
-                jnp.array(first + self.window, jnp.int32),
-                jnp.array(last - self.lag - 1, jnp.int32),
-            ),
+        return self.having(
+            limits=jnp.asarray(limits, jnp.float32),
+            center=jnp.asarray(np.nan_to_num(center), jnp.float32),
+            scale=jnp.asarray(np.where(scale > 0, scale, 1.0), jnp.float32),
+            first_decision=jnp.array(first + self.window, jnp.int32),
+            last_decision=jnp.array(last - self.lag - 1, jnp.int32),
+            allowed=allowed,
         )
-        return part if allowed is None else eqx.tree_at(lambda t: t.allowed, part, allowed)
 
     @property
     def parts(self) -> list[object]:

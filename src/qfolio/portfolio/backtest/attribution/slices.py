@@ -128,7 +128,7 @@ def answer(
     task: Portfolio, agent: Agent, members: PyTree, row: Array, features: Array, held: Array
 ) -> Float[Array, " entry"]:
     """The target weights at a row with the given features, the mean of all members."""
-    asked = eqx.tree_at(lambda t: t.decides, task, jnp.ones_like(task.decides))  # on any day
+    asked = task.having(decides=jnp.ones_like(task.decides))  # on any day
     observed = jnp.swapaxes(features * task.scale + task.center, 0, 1)
     seen = Observed.given(asked, observed, row - task.window + 1)
     holding = seen.hold(held)
