@@ -22,10 +22,11 @@ from matplotlib import get_data_path
 from PIL import Image, ImageDraw, ImageFont
 
 from qfolio.report.board.server import Board
+from qfolio.report.printing import find_browser
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "tests"))
-from browser import Browser, find_chromium  # noqa: E402
+from browser import Browser  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
 QFOLIO = [sys.executable, "-m", "qfolio"]
@@ -160,7 +161,7 @@ def _photograph(browser: Browser) -> Image.Image:
 
 
 def film_board(folder: str) -> None:
-    chromium = find_chromium()
+    chromium = find_browser()
     assert chromium, "The film of the board needs Chromium."
     runs = Path(folder, "board")
     runs.mkdir()

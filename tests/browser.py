@@ -3,7 +3,6 @@
 import json
 import os
 import select
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from qfolio.report.printing import find_browser
 
 _EXECUTE = """
 import os, sys
@@ -150,17 +151,11 @@ class Browser:
         os.close(self._read)
 
 
-def find_chromium() -> str | None:
-    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-    chosen = os.environ.get("QFOLIO_CHROMIUM")
-    return shutil.which(chosen) if chosen else next(filter(None, map(shutil.which, names)), None)
-
-
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     if os.name != "posix":
         pytest.skip("driving Chromium through pipes needs a POSIX system")
-    program = find_chromium()
+    program = find_browser()
     if program is None:
         pytest.skip(
             "no Chromium found: install it (apt install chromium) or name it in QFOLIO_CHROMIUM"

@@ -6,37 +6,27 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.costs import Proportional
 from qfolio.portfolio.desk.allocation import Allocation, require_fresh
 from qfolio.portfolio.desk.ledger import Ledger, holdings_digest
 from qfolio.portfolio.desk.orders_csv import order_rows
+from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.limits import mandate_text
-from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
-from qfolio.portfolio.task import Portfolio
+
+from fixed import Fixed
 
 PRICES = Prices(
     np.array(["2024-12-30", "2024-12-31"], "datetime64[s]"),
     ("A", "B"),
     np.array([[10.0, 50], [20, 40]]),
 )
-TASK = Portfolio.of(
-    Prices(np.arange(8).astype("datetime64[D]"), ("A", "B"), np.ones((8, 2))), window=1, horizon=1
-)
-
-
-class Fixed(Policy):
-    """Wants the same weights whatever it sees."""
-
-    def __init__(self, wanted, cost):
-        self.wanted = dict(zip(("cash", "A", "B"), wanted, strict=True))
-        self.task = dataclasses.replace(TASK, cost=cost)
-
-    def weights(self, prices, holdings=None, **options):
-        return self.wanted
+FREE, FEE = Proportional(0.0), Itemized(0.0, fixed=5.0, capital=1000.0)
 
 
 def plan(weights, shares, cash, cost=0.01, **options):
-    return Allocation.of(Fixed(weights, cost), PRICES, np.array(shares, float), cash, **options)
+    policy = Fixed(weights, Proportional(cost))
+    return Allocation.of(policy, PRICES, np.array(shares, float), cash, **options)
 
 
 def test_from_cash_by_hand():
@@ -58,7 +48,7 @@ def test_from_one_asset_to_the_other_by_hand():
 class Keeping(Fixed):
     """Wants what it holds."""
 
-    def weights(self, prices, holdings=None, **options):
+    def weights(self, prices, holdings=None, *, spent=0.0):
         assert min(holdings.values()) >= 0
         return holdings
 
@@ -66,12 +56,13 @@ class Keeping(Fixed):
 def test_an_overdraft_is_repaid():
     """Prices rose before trades were filled: 100 in A and 100 in B, and 4 of them borrowed."""
     shares = np.array([5, 2.5])
-    allocation = Allocation.of(Keeping([1, 0, 0], 0.01), PRICES, shares, -4.0, debts=False)
+    keeping = Keeping([1, 0, 0], Proportional(0.01))
+    allocation = Allocation.of(keeping, PRICES, shares, -4.0, debts=False)
     assert allocation.cash_after == pytest.approx(0, abs=1e-9)
     np.testing.assert_allclose(allocation.trades * [20, 40], [-2 / 0.99] * 2)
     with pytest.raises(QfolioError, match="an overdraft of 11"):
-        Allocation.of(Keeping([1, 0, 0], 0.01), PRICES, shares, -20.0, debts=False)
-    assert Allocation.of(Fixed([-0.1, 0.5, 0.6], 0), PRICES, shares, -20.0).wealth == 180
+        Allocation.of(keeping, PRICES, shares, -20.0, debts=False)
+    assert Allocation.of(Fixed([-0.1, 0.5, 0.6], FREE), PRICES, shares, -20.0).wealth == 180
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -209,9 +200,7 @@ def test_nothing_to_allocate():
 
 def test_costs_by_kind():
     """Two orders of 1 money each, and a spread of 2% of which half is paid."""
-    policy = Fixed([0.2, 0.4, 0.4], 0.0)
-    model = "itemized(fixed=1,spread=0.02)"
-    policy.task = dataclasses.replace(policy.task, cost_model=model)
+    policy = Fixed([0.2, 0.4, 0.4], Itemized(0.0, fixed=1.0, spread="0.02"))
     allocation = Allocation.of(policy, PRICES, np.zeros(2), 10_000.0, whole_shares=True)
     assert allocation.costs["fixed"] == pytest.approx(2)
     bought = allocation.trades @ allocation.prices
@@ -242,8 +231,7 @@ def test_prices_of_another_day():
 @pytest.mark.parametrize("whole", [False, True])
 def test_what_keeps_its_weight_is_no_order_and_pays_no_fee(whole):
     """Of 1,000, half in each; 100 of A are sold at a fee of 5, and B stays as it is."""
-    policy = Fixed([0.1, 0.4, 0.5], 0)
-    policy.task = dataclasses.replace(TASK, cost=0.0, cost_model="itemized(fixed=5,capital=1000)")
+    policy = Fixed([0.1, 0.4, 0.5], FEE)
     shares = np.array([25.0, 12.5])
     allocation = Allocation.of(policy, PRICES, shares, 0.0, whole_shares=whole)
     sold = 5 if whole else 25 - 495 * 0.8 / 20  # of the 500 that pay, a fifth becomes cash
@@ -258,8 +246,7 @@ def test_an_order_that_costs_more_than_it_moves_is_left_out(shares):
     """Weights times wealth are not always the money held, to the last digit."""
     held = np.array(shares) * [20, 40]
     sold = held[0] / held.sum()
-    policy = Fixed([sold, 0.0, 1 - sold], 0)
-    policy.task = dataclasses.replace(TASK, cost=0.0, cost_model="itemized(fixed=5,capital=1000)")
+    policy = Fixed([sold, 0.0, 1 - sold], FEE)
     allocation = Allocation.of(policy, PRICES, np.array(shares), 0.0)
     assert not allocation.trades.any()
     assert (allocation.cost, allocation.cash_after) == (0, 0)
@@ -267,8 +254,7 @@ def test_an_order_that_costs_more_than_it_moves_is_left_out(shares):
 
 def test_what_keeps_its_weight_beside_debts_is_no_order_either():
     """Of 1,000, A falls from 120% to 110%; the 20% of B that are owed stay as they are."""
-    policy = Fixed([0.1, 1.1, -0.2], 0)
-    policy.task = dataclasses.replace(TASK, cost=0.0, cost_model="itemized(fixed=5,capital=1000)")
+    policy = Fixed([0.1, 1.1, -0.2], FEE)
     allocation = Allocation.of(policy, PRICES, np.array([60.0, -5.0]), 0.0)
     left = 0.995  # of the wealth; A is scaled to it, and cash takes the rest
     np.testing.assert_allclose(allocation.trades, [1100 * left / 20 - 60, 0], atol=1e-9)
@@ -281,9 +267,8 @@ def test_what_keeps_its_weight_beside_debts_is_no_order_either():
 
 def test_an_overdraft_that_no_order_repays_is_said():
     """50 shares are less than a lot."""
-    policy = Fixed([0, 1, 0], 0.01)
     mandate = mandate_text({"trading": {"lot": 100}}, ("A", "B"))
-    policy.task = dataclasses.replace(TASK, mandate=mandate)
+    policy = Fixed([0, 1, 0], Proportional(0.001), mandate)
     allocation = Allocation.of(policy, PRICES, np.array([50.0, 0.0]), -40.0, debts=False)
     assert not allocation.trades.any()
     assert allocation.cash_after == -40
@@ -292,11 +277,10 @@ def test_an_overdraft_that_no_order_repays_is_said():
 
 def test_only_what_is_traded_counts_as_turnover(tmp_path):
     """All are due to fall by 1% of the wealth, and a lot is more than all."""
-    policy = Fixed([0.02, 0.49, 0.49], 0)
     mandate = mandate_text({"trading": {"lot": 1000}}, ("A", "B"))
     ledger = Ledger(tmp_path)
     for lots, turnover in ((True, 0.0), (False, 0.02)):
-        policy.task = dataclasses.replace(TASK, cost=0.0, mandate=mandate if lots else "")
+        policy = Fixed([0.02, 0.49, 0.49], FREE, mandate if lots else "")
         allocation = Allocation.of(policy, PRICES, np.array([250.0, 125.0]), 0.0)
         assert allocation.trades.any() != lots
         assert allocation.turnover == pytest.approx(turnover)

@@ -10,10 +10,11 @@ from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import Proportional
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.follow import Following
-from qfolio.portfolio.desk.ledger import Record
+from qfolio.portfolio.desk.ledger import Record, _of
 from qfolio.portfolio.desk.live import mark
 from qfolio.portfolio.itemized import Itemized
 
+from fixed import Fixed
 from tables import days, price_table, random_walk
 
 NAMES = ("A", "B", "C")
@@ -24,38 +25,12 @@ def table(rows=60, seed=0):
     return price_table(values, dates=days(rows, "2024-01-01"))
 
 
-class Fixed:
-    mandate = ""
-
-    def __init__(self, wanted, costs):
-        self.wanted, self.costs = wanted, costs
-
-    def weights(self, prices, holdings=None, *, spent=0.0):
-        return dict(zip(("cash", *prices.assets), self.wanted.tolist(), strict=True))
-
-
 def record(allocation, number):
     """As the ledger has it."""
     return Record(
-        number=number,
-        date=allocation.date,
-        made="",
-        version="",
-        agent="x",
-        policy=None,
-        digests={},
-        whole_shares=False,
-        assets=list(allocation.assets),
-        prices=allocation.prices.tolist(),
-        shares=allocation.shares.tolist(),
-        cash=float(allocation.cash),
-        trades=allocation.trades.tolist(),
-        cash_after=allocation.cash_after,
-        weights_before=allocation.held.tolist(),
-        target=allocation.weights.tolist(),
-        weights_after=allocation.reached.tolist(),
-        costs=allocation.costs,
-    )
+        number=number, made="", version="", agent="x", policy=None, digests={}, whole_shares=False,
+        **_of(allocation),
+    )  # fmt: skip
 
 
 def traded(prices, model, rows, targets):

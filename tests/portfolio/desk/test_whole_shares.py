@@ -10,17 +10,7 @@ from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.mandate.limits import mandate_text
 from qfolio.portfolio.prices.table import Prices
 
-
-class Fixed:
-    """Wants the same weights whatever it sees."""
-
-    mandate = ""
-
-    def __init__(self, wanted, cost):
-        self.wanted, self.costs = wanted, Proportional(cost)
-
-    def weights(self, prices, holdings=None, *, spent=0.0):
-        return dict(zip(("cash", *prices.assets), self.wanted.tolist(), strict=True))
+from fixed import Fixed
 
 
 def case(seed, fractions=False):
@@ -35,7 +25,7 @@ def case(seed, fractions=False):
     cash, target = float(rng.uniform(1, 4000)), rng.dirichlet(np.ones(count + 1))
     names = tuple("ABCDEFGH"[:count])
     table = Prices(np.arange(2).astype("datetime64[D]"), names, np.stack([prices, prices]))
-    policy = Fixed(target, cost)
+    policy = Fixed(target, Proportional(cost))
     ideal = Allocation.of(policy, table, shares, cash)
     whole = Allocation.of(policy, table, shares, cash, whole_shares=True)
 
@@ -74,7 +64,7 @@ def test_an_overdraft_is_repaid_in_whole_shares(seed):
     prices, shares = np.exp(rng.normal(4, 1, 4)), rng.integers(5, 20, 4).astype(float)
     table = Prices(np.arange(2).astype("datetime64[D]"), tuple("ABCD"), np.stack([prices, prices]))
     weights = shares * prices * np.exp(rng.normal(0, 0.02, 4))
-    policy = Fixed(np.append(0.0, weights / weights.sum()), 0.001)
+    policy = Fixed(np.append(0.0, weights / weights.sum()), Proportional(0.001))
     cash = -0.02 * float(shares @ prices)
     found = Allocation.of(policy, table, shares, cash, whole_shares=True, debts=False)
     assert 0 <= found.cash_after == pytest.approx(money_left(found, found.trades, 0.001), abs=1e-6)
@@ -89,7 +79,7 @@ def test_lots_of_a_mandate_are_traded_whole_and_single_shares_of_a_split_are_the
         finer = Prices(
             np.arange(2).astype("datetime64[D]"), names, np.tile(whole.prices / lot, (2, 1))
         )
-        policy = Fixed(whole.weights, cost)
+        policy = Fixed(whole.weights, Proportional(cost))
         policy.mandate = mandate_text(
             {"trading": {"lot": dict(zip(names, lot.tolist(), strict=True))}}, names
         )
@@ -128,8 +118,8 @@ def test_the_rounding_is_nearly_the_best_of_all():
 
 def test_a_full_account_sells_no_lot_that_it_could_keep():
     """5,000 in each asset, of which 100 should go; a lot of A is 2,000, and one of B 4,000."""
-    policy = Fixed(np.array([0.02, 0.49, 0.49]), 0.001)
-    policy.mandate = mandate_text({"trading": {"lot": 100}}, ("A", "B"))
+    mandate = mandate_text({"trading": {"lot": 100}}, ("A", "B"))
+    policy = Fixed([0.02, 0.49, 0.49], Proportional(0.001), mandate)
     dates, prices = np.arange(2).astype("datetime64[D]"), np.array([[20.0, 40.0]] * 2)
     table = Prices(dates, ("A", "B"), prices)
     assert not Allocation.of(policy, table, np.array([250.0, 125.0]), 0.0).trades.any()
@@ -145,7 +135,7 @@ def test_the_rounding_is_nearly_the_best_where_all_is_invested_in_few_lots():
         weights = shares * prices * np.exp(rng.normal(0, 0.05, count))
         names = tuple("ABCDE"[:count])
         table = Prices(np.arange(2).astype("datetime64[D]"), names, np.stack([prices, prices]))
-        policy = Fixed(np.append(0.0, weights / weights.sum()), cost)
+        policy = Fixed(np.append(0.0, weights / weights.sum()), Proportional(cost))
         ideal = Allocation.of(policy, table, shares, 0.0)
         policy.mandate = mandate_text({"trading": {"lot": lot}}, names)
         found = Allocation.of(policy, table, shares, 0.0)
