@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES, find
 from qfolio.portfolio.backtest.baselines import Baseline, Fitted, History, baseline
+from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import Orders, orders
 from qfolio.portfolio.backtest.simulation import simulate
 
@@ -23,16 +24,14 @@ from tables import days
 FITTED = [name for name in BASELINES if isinstance(baseline(name), Fitted)]
 
 
-class Fold(NamedTuple):
-    name: str
-    train: slice
-    decisions: slice
+def fold(name: str, train: slice, decided: slice) -> Fold:
+    return Fold(name, train, decided, recent=train)
 
 
 def walk(rows: int, train: int, test: int, count: int | None = None) -> list[Fold]:
     """Whole folds whose training ends with the first decision; each decision earns a return."""
     starts = range(train, rows - test, test)[:count]
-    return [Fold(str(i), slice(s - train, s + 1), slice(s, s + test)) for i, s in enumerate(starts)]
+    return [fold(str(i), slice(s - train, s + 1), slice(s, s + test)) for i, s in enumerate(starts)]
 
 
 def prices(rows: int = 90, assets: int = 4) -> np.ndarray:
@@ -339,7 +338,7 @@ def test_errors_say_what_and_where() -> None:
     with pytest.raises(QfolioError, match="no fold"):
         decisions("equal-weight", [], prices())
     with pytest.raises(QfolioError, match="Fold x trains on rows up to 41, but decides from row 4"):
-        decisions("equal-weight", [Fold("x", slice(0, 42), slice(40, 50))], prices())
+        decisions("equal-weight", [fold("x", slice(0, 42), slice(40, 50))], prices())
     with pytest.raises(QfolioError, match="Fold 2 decides from row 70 on, but fold 0 before row 5"):
         decisions("equal-weight", FOLDS[::2], prices())
 

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NamedTuple, Protocol, get_args, runtime_checkable
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from qfolio.core.arrays import Bools, Floats, numbers
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, Calendar, History
+from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.growth import Growth, filled_in
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel, Proportional, cashed
@@ -22,18 +23,6 @@ TOLERANCE = 1e-6
 """How far weights may be off the simplex or above the cap."""
 
 AT_EVERY_ROW = Terms(np.zeros(0, bool), np.zeros(0))
-
-
-@runtime_checkable
-class Fold(Protocol):
-    """Rows of the price table: where to learn and where to decide."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def train(self) -> slice: ...
-    @property
-    def decisions(self) -> slice: ...
 
 
 class Orders(NamedTuple):

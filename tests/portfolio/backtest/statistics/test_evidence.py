@@ -1,7 +1,5 @@
 """On random walks nothing can be learned: how often a verdict says otherwise."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 
@@ -12,6 +10,7 @@ from qfolio.portfolio.backtest.baselines.equal_weight import (
     EqualWeight,
     EqualWeightAt,
 )
+from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.backtest.statistics.assessment import Assessment, Strategy, assess
@@ -19,12 +18,7 @@ from qfolio.portfolio.backtest.statistics.assessment import Assessment, Strategy
 from tables import days
 
 ASSETS, ROWS, YEAR = 6, 757, 252
-
-
-class Fold(NamedTuple):
-    name: str = "0"
-    train: slice = slice(0, 1)
-    decisions: slice = slice(0, ROWS - 2)
+FOLD = Fold("0", slice(0, 1), slice(0, ROWS - 2), slice(0, 1))
 
 
 def world(rng: np.random.Generator, cost: float = 0.005) -> Assessment:
@@ -37,7 +31,7 @@ def world(rng: np.random.Generator, cost: float = 0.005) -> Assessment:
         return Strategy(kind, found.returns, found.turnover, found.cost)
 
     def replayed(kind: str, made: Baseline) -> Strategy:
-        return strategy(kind, orders("own", made, [Fold()], days(ROWS), values).decisions[None])
+        return strategy(kind, orders("own", made, [FOLD], days(ROWS), values).decisions[None])
 
     def tilted(size: float) -> np.ndarray:
         decisions = np.full((1, ROWS - 2, ASSETS + 1), np.nan)
