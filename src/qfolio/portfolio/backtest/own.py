@@ -163,7 +163,7 @@ def _placed_weights(
     return Placed(decisions, None, tuple(notes))
 
 
-def kept(
+def compliance(
     name: str, decisions: Floats, turnover: Floats, mandates: Sequence[tuple[slice, Mandated]]
 ) -> str:
     """Says where a strategy's orders break the mandate; they are carried out all the same.

@@ -16,7 +16,7 @@ from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeight
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
 from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import Orders, orders
-from qfolio.portfolio.backtest.own import Placed, kept
+from qfolio.portfolio.backtest.own import Placed, compliance
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.backtest.statistics.assessment import Strategy
 from qfolio.portfolio.conditions import Conditions
@@ -223,7 +223,7 @@ class Replay:
             entries[name] = self.own("baseline" if name == benchmark else "strategy", placed)
             notes += placed.notes
             if self.task.mandate and name != benchmark:
-                notes.append(self._kept(name, entries[name]))
+                notes.append(self._compliance(name, entries[name]))
         speeds = SPEEDS if benchmark == EQUAL_WEIGHT else ()
         slower = {f"{EQUAL_WEIGHT} at {speed:g}": EqualWeightAt(speed) for speed in speeds}
         for kind, rules in (("baseline", baselines), ("rebalancing", slower)):
@@ -232,7 +232,7 @@ class Replay:
                 notes += said
         return entries, notes
 
-    def _kept(self, name: str, entry: Entry) -> str:
+    def _compliance(self, name: str, entry: Entry) -> str:
         """Says whether a strategy of the user's own keeps the mandate."""
         if not entry.weighted:
             return f"{name} has returns only, so whether it keeps the mandate is not known."
@@ -241,7 +241,7 @@ class Replay:
             rows = np.arange(fold.decisions.start, fold.decisions.stop)
             here = made if self.patterns is None else self.patterns[0].at(rows, made)
             allowed.append((slice(rows[0] - first, rows[-1] + 1 - first), here))
-        return kept(name, entry.decisions[0], entry.simulation.turnover[0], allowed)
+        return compliance(name, entry.decisions[0], entry.simulation.turnover[0], allowed)
 
     def entry(self, kind: str, decisions: np.ndarray, costs: CostModel | None = None) -> Entry:
         """A strategy by its decisions of shape (seed, day, entry); costs: default, the task's."""
