@@ -19,7 +19,7 @@ def rules(cost_model: str) -> Replay:
 
 
 def orders(replay: Replay, seeds: int) -> np.ndarray:
-    days = sum(fold.decisions.stop - fold.decisions.start for fold in replay.folds)
+    days = sum(fold.days for fold in replay.folds)
     return np.random.default_rng(0).dirichlet(np.ones(7), (seeds, days))
 
 

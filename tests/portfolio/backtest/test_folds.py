@@ -37,7 +37,7 @@ def test_returns_follow_each_other_and_training_ends_before_the_first_decision(l
 def test_rolling_training_keeps_its_length():
     folds = walk_forward(DAYS, "500d", "100d", 1)
     assert {fold.train.stop - fold.train.start for fold in folds[1:]} == {501}
-    assert {fold.decisions.stop - fold.decisions.start for fold in folds[:-1]} == {100}
+    assert {fold.days for fold in folds[:-1]} == {100}
 
 
 def test_calendar_lengths():
@@ -53,7 +53,7 @@ def test_a_year_of_last_trading_days_has_all_its_months(months, rows):
     following = np.datetime64("1983-02") + np.arange(0, 480, months).astype("m8[M]")
     dates = np.busday_offset(following.astype("M8[D]"), -1, roll="forward")
     folds = walk_forward(dates, "5y", "1y", 1, expanding=False)
-    lengths = [fold.decisions.stop - fold.decisions.start for fold in folds]
+    lengths = [fold.days for fold in folds]
     assert lengths == [rows] * 35
     assert {fold.train.stop - fold.train.start for fold in folds[1:]} == {5 * rows + 1}
 

@@ -19,6 +19,11 @@ class Fold(NamedTuple):
     decisions: slice
     recent: slice  # the final ``train``-length window
 
+    @property
+    def days(self) -> int:
+        """Number of its decisions."""
+        return int(self.decisions.stop - self.decisions.start)
+
     def tradable(self, values: np.ndarray) -> np.ndarray:
         """Assets with a price in every row of the recent window, shape (asset,)."""
         return ~np.isnan(values[self.recent]).any(0)
@@ -28,6 +33,17 @@ class Fold(NamedTuple):
         gaps = np.isnan(values[self.train][:, self.tradable(values)]).any(1)
         begin = self.train.start + int(gaps.sum())  # prices are missing only before a first one
         return self._replace(train=slice(begin, self.train.stop))
+
+
+def tested(folds: Sequence[Fold]) -> slice:
+    """The rows at which folds that follow one another decide."""
+    return slice(folds[0].decisions.start, folds[-1].decisions.stop)
+
+
+def days_of(folds: Sequence[Fold]) -> list[slice]:
+    """The days on which each fold decides, counted from the first decision of all."""
+    first = folds[0].decisions.start
+    return [slice(fold.decisions.start - first, fold.decisions.stop - first) for fold in folds]
 
 
 def walk_forward(

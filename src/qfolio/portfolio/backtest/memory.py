@@ -22,7 +22,7 @@ MENTIONED = 2**30
 def needed(prices: Prices, config: BacktestConfig) -> int:
     """About how many bytes a backtest has in memory at once, besides those that training takes."""
     folds = walk_forward(prices.dates, config.train, config.test, config.lag, config.expanding)
-    days = folds[-1].decisions.stop - folds[0].decisions.start
+    days = sum(fold.days for fold in folds)
     channels = [
         Portfolio.blank(
             len(prices.assets),

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from qfolio.core.arrays import Bools, Floats, numbers
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, Calendar, History
-from qfolio.portfolio.backtest.folds import Fold
+from qfolio.portfolio.backtest.folds import Fold, tested
 from qfolio.portfolio.backtest.growth import Growth, filled_in
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel, Proportional, cashed
@@ -88,10 +88,11 @@ def orders(
     _check(folds)
     conditions = Conditions(np.empty(0), {}, {}) if conditions is None else conditions
     growth = Growth(filled_in(prices)[0], costs or Proportional(), conditions)
-    first, stop = folds[0].decisions.start, folds[-1].decisions.stop
+    decided = tested(folds)
+    first = decided.start
     account = _Account(growth, terms, universe, first)
     asks, gives = _calendar(baseline, folds, len(prices), month, terms, universe is not None)
-    decisions, notes = np.full((stop - first, prices.shape[1] + 1), np.nan), []
+    decisions, notes = np.full((decided.stop - first, prices.shape[1] + 1), np.nan), []
     for number, fold in enumerate(folds):
         tradable = _tradable(baseline, fold, prices, universe)
         wanted = None

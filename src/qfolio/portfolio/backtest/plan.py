@@ -16,7 +16,7 @@ from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.executor import Executor, Job, at_once
 from qfolio.portfolio.backtest.folder import BacktestConfig
-from qfolio.portfolio.backtest.folds import Fold, latest, walk_forward
+from qfolio.portfolio.backtest.folds import Fold, latest, tested, walk_forward
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow, updates_of
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.mandate.limits import mandate_text
@@ -72,7 +72,7 @@ class Plan:
     @property
     def decisions(self) -> slice:
         """Rows of the test's decisions."""
-        return slice(self.folds[0].decisions.start, self.folds[-1].decisions.stop)
+        return tested(self.folds)
 
     @property
     def dates(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from qfolio.core.mdp import Agent
 from qfolio.portfolio.backtest.baselines import Baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
-from qfolio.portfolio.backtest.folds import Fold
+from qfolio.portfolio.backtest.folds import Fold, days_of, tested
 from qfolio.portfolio.backtest.orders import Orders, orders
 from qfolio.portfolio.backtest.own import Placed, compliance
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
@@ -77,15 +77,15 @@ def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: 
     """
     cash = np.eye(1 + len(stretches[0].task.limits))[:1]
     held = begin(stretches[0].task, np.repeat(cash, seeds, 0))
-    days = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
+    longest = max(fold.days for *_, fold in stretches)
     parts = []
-    for (task, members, fold), count in zip(stretches, days, strict=True):
+    for task, members, fold in stretches:
         # One length for all folds, so that one program serves all; the surplus is cut off.
         start = fold.decisions.start
-        targets, after = follow(task, agent, members, start, held, max(days), together=together)
+        targets, after = follow(task, agent, members, start, held, longest, together=together)
         given = ordered(task, targets, held.weights, np.asarray(after.weights))
-        parts.append(np.where(given[..., None], targets, np.nan)[:, :count])
-        held = jax.tree.map(lambda x, last=count - 1: x[:, last], after)
+        parts.append(np.where(given[..., None], targets, np.nan)[:, : fold.days])
+        held = jax.tree.map(lambda x, last=fold.days - 1: x[:, last], after)
     return np.concatenate(parts, axis=1)
 
 
@@ -112,8 +112,8 @@ class Replay:
     @cached_property
     def rows(self) -> np.ndarray:
         """The row at which each of the test's returns begins, shape (day,)."""
-        begin, end = self.folds[0].decisions.start, self.folds[-1].decisions.stop
-        return np.arange(begin, end) + self.task.lag
+        decided = tested(self.folds)
+        return np.arange(decided.start, decided.stop) + self.task.lag
 
     @cached_property
     def relatives(self) -> np.ndarray:
@@ -236,11 +236,13 @@ class Replay:
         """Says whether a strategy of the user's own keeps the mandate."""
         if not entry.weighted:
             return f"{name} has returns only, so whether it keeps the mandate is not known."
-        first, allowed = self.folds[0].decisions.start, []
-        for fold, (made, _) in zip(self.folds, self.relaxed, strict=True):
+        allowed = []
+        for fold, days, (made, _) in zip(
+            self.folds, days_of(self.folds), self.relaxed, strict=True
+        ):
             rows = np.arange(fold.decisions.start, fold.decisions.stop)
             here = made if self.patterns is None else self.patterns[0].at(rows, made)
-            allowed.append((slice(rows[0] - first, rows[-1] + 1 - first), here))
+            allowed.append((days, here))
         return compliance(name, entry.decisions[0], entry.simulation.turnover[0], allowed)
 
     def entry(self, kind: str, decisions: np.ndarray, costs: CostModel | None = None) -> Entry:

@@ -25,6 +25,7 @@ from qfolio.portfolio.backtest.attribution.replays import (
 from qfolio.portfolio.backtest.attribution.slices import slices
 from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
 from qfolio.portfolio.backtest.folder import followed
+from qfolio.portfolio.backtest.folds import days_of, tested
 from qfolio.portfolio.backtest.replay import Entry, Stretch
 from qfolio.portfolio.backtest.run import Backtest
 
@@ -50,11 +51,8 @@ def _explained(
 ) -> tuple[AgentWhy, dict[str, list[str]]]:
     """An agent's attributions, and the diagnosis of each of its entries."""
     prices, config, agent = backtest.prices, backtest.config, backtest.agents[name]
-    begin = backtest.folds[0].decisions.start
-    folds = {
-        fold.name: slice(fold.decisions.start - begin, fold.decisions.stop - begin)
-        for fold in backtest.folds
-    }
+    names_of = [fold.name for fold in backtest.folds]
+    folds = dict(zip(names_of, days_of(backtest.folds), strict=True))
     year = prices.periods_per_year
     reference = entries[config.benchmark].simulation.returns[0]
     traded = followed(name, entries)
@@ -98,15 +96,14 @@ def _explained(
 
 def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> Rule:
     """The linear rule of an agent's decisions, fitted on every other fold."""
-    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
-    task, days = stretches[0].task, end - begin
-    tradable, fitted = open_to(stretches), np.zeros(days, bool)
-    for i, (*_, fold) in enumerate(stretches):
-        rows = slice(fold.decisions.start - begin, fold.decisions.stop - begin)
-        fitted[rows] = i % 2 == 0
-    if len(stretches) == 1:
-        fitted[days // 2 :] = False
-    anchor = np.asarray(task.anchors)[begin:end] if task.anchor else np.zeros_like(tradable)
+    task, folds = stretches[0].task, [fold for *_, fold in stretches]
+    tradable = open_to(stretches)
+    fitted = np.zeros(len(tradable), bool)
+    for days in days_of(folds)[::2]:
+        fitted[days] = True
+    if len(folds) == 1:
+        fitted[len(fitted) // 2 :] = False
+    anchor = np.asarray(task.anchors)[tested(folds)] if task.anchor else np.zeros_like(tradable)
     seen = seen_in_test(stretches)
     given = ~np.isnan(decisions[:, 0])  # there are no orders between a calendar's decisions
     ordered, anchor, seen = decisions[given, 1:], anchor[given], seen[given]

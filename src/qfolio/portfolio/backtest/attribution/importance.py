@@ -144,7 +144,7 @@ def _affordable(stretches: Sequence[Stretch], count: int) -> tuple[bool, int, in
     """Whether to shuffle signals one by one, the number of draws, and the number of seeds."""
     task = stretches[0].task
     seeds = int(jax.tree.leaves(stretches[0].members)[0].shape[0])
-    days = sum(fold.decisions.stop - fold.decisions.start for *_, fold in stretches)
+    days = sum(fold.days for *_, fold in stretches)
     read = days * task.limits.shape[0] * task.window * count
     for draws, followed in ((DRAWS, seeds), (1, seeds), (1, 1)):
         if read * followed * (1 + draws * (count + 1)) <= WORK:

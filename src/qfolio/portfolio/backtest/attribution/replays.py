@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from qfolio.core.mdp import Agent
 from qfolio.portfolio import signals
+from qfolio.portfolio.backtest.folds import tested
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.following import begin, paths
 from qfolio.portfolio.market import Holding
@@ -78,8 +79,8 @@ class Shuffles(NamedTuple):
     def drawn(stretches: Sequence[Stretch], count: int, block: int, seed: int) -> "Shuffles":
         """Draws with a fixed seed, in blocks of rows; assets tradable throughout are relabeled."""
         task, folds = stretches[0].task, [fold for *_, fold in stretches]
-        longest = max(fold.decisions.stop - fold.decisions.start for fold in folds)
-        begin, end = folds[0].decisions.start - task.window + 1, folds[-1].decisions.stop
+        longest, decided = max(fold.days for fold in folds), tested(folds)
+        begin, end = decided.start - task.window + 1, decided.stop
         length, assets = end - begin, task.limits.shape[0]
         block = max(1, min(block, length // 4))
         rng = np.random.default_rng(seed)
@@ -128,13 +129,13 @@ def channels(task: Portfolio) -> Float[Array, "row asset channel"]:
 
 def seen_in_test(stretches: Sequence[Stretch]) -> np.ndarray:
     """All channels on the days of the test, before scaling; 0 where unknown."""
-    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
-    return np.nan_to_num(np.asarray(channels(stretches[0].task))[begin:end])
+    days = tested([fold for *_, fold in stretches])
+    return np.nan_to_num(np.asarray(channels(stretches[0].task))[days])
 
 
 def open_to(stretches: Sequence[Stretch]) -> np.ndarray:
     """Which assets the fold, the mandate and the table let be bought, of shape (days, assets)."""
-    days = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
+    days = [fold.days for *_, fold in stretches]
     allowed = np.repeat([np.asarray(task.limits) > 0 for task, *_ in stretches], days, axis=0)
     tradable, begin = stretches[0].task.tradable, stretches[0].fold.decisions.start
     if tradable is None:
@@ -170,12 +171,12 @@ def _replay(
     agent: Agent, stretches: Sequence[Stretch], shuffles: Shuffles, wanted: Sequence[Shuffle]
 ) -> Replays:
     masks, rows, assets = (jnp.asarray(np.array(x)) for x in zip(*wanted, strict=True))
-    counts = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
+    longest = max(fold.days for *_, fold in stretches)
     cash = np.eye(shuffles.own.shape[1] + 1)[:1]
     held = begin(stretches[0].task, np.repeat(cash, len(wanted), 0))
     targets, before = [], []
-    for (task, members, fold), count in zip(stretches, counts, strict=True):
-        start, longest = fold.decisions.start, max(counts)
+    for task, members, fold in stretches:
+        start, count = fold.decisions.start, fold.days
         here = slice(start - task.window + 1 - shuffles.begin, None)
         seen = slice(here.start, here.start + task.window - 1 + longest)
         drawn = [jnp.asarray(x[:, seen]) for x in (shuffles.rows, shuffles.assets)]
