@@ -127,6 +127,17 @@ class Unbounded(Tiny):
     action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
 
 
+class Unmade(Tiny):
+    def __init__(self):
+        raise OSError("no license")
+
+
+class Spaceless(gymnasium.Env):
+    """Forgets to say what it shows."""
+
+    action_space = gymnasium.spaces.Discrete(2)
+
+
 class Faulty(Tiny):
     """Does at its second step, or at its start, what no environment should."""
 
@@ -154,7 +165,10 @@ class Faulty(Tiny):
         return seen, reward, False, False, {}
 
 
-KINDS = (Delay, Endless, Numbered, Aim, Narrow, Shares, Signed, Named, Unbounded, Faulty)
+KINDS = (
+    Delay, Endless, Numbered, Aim, Narrow, Shares, Signed, Named, Unbounded, Unmade,
+    Spaceless, Faulty,
+)  # fmt: skip
 ENVIRONMENTS = {kind: f"Test{kind.__name__}-v0" for kind in KINDS}
 for _kind, _id in ENVIRONMENTS.items():
     gymnasium.register(_id, entry_point=_kind, max_episode_steps=4)
@@ -333,8 +347,14 @@ def test_returns_do_not_reach_from_a_cut_episode_into_a_new_one():
         (lambda: GymnasiumTask("Nowhere/X-v0"), "Nowhere"),
         (lambda: GymnasiumTask("no_such_module:X-v0"), "no_such_module cannot be imported"),
         (lambda: task(Named), "observations of TestNamed-v0 are Dict.*FlattenObservation"),
+        (lambda: task(Spaceless), "observations of TestSpaceless-v0 are None, but agents need"),
         (lambda: task(Unbounded), "actions of TestUnbounded-v0 .* bounds"),
         (lambda: task(Endless, kwargs='{"cuts": 3}'), "cannot be made with kwargs"),
+        (
+            lambda: GymnasiumTask("FrozenLake-v1", kwargs='{"map_name": "9x9"}'),
+            r"""FrozenLake-v1 cannot be made with kwargs={"map_name": "9x9"}: KeyError: '9x9' \(""",
+        ),
+        (lambda: task(Unmade), r"TestUnmade-v0 cannot be made: OSError: no license \(test_host"),
         (lambda: task(Endless, kwargs="cut=3"), "JSON object"),
         (lambda: task(Endless, kwargs={"cut": 3}), "kwargs is {'cut': 3}; it must be JSON"),
         (lambda: task(Delay, horizon=-1), "horizon is -1"),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from qfolio.core.errors import QfolioError, require_type
+from qfolio.core.errors import QfolioError, one_line, require_type
 from qfolio.core.fields import require, static
 from qfolio.core.host import HostTask
 from qfolio.core.mdp import Box, Discrete, Step
@@ -144,7 +144,8 @@ _known: dict[tuple[str, str], tuple[Any, Facts]] = {}
 def _read(id: str, kwargs: str) -> Facts:
     spaces = _gymnasium().spaces
     env = _make(id, kwargs)
-    seen, done = env.observation_space, env.action_space
+    seen: Any = getattr(env, "observation_space", None)
+    done: Any = getattr(env, "action_space", None)
     env.close()
     if isinstance(seen, spaces.Box):
         low, high = seen.low.astype(float), seen.high.astype(float)
@@ -190,6 +191,9 @@ def _make(id: str, kwargs: str, **options: Any) -> Any:
         raise QfolioError(f"{id} cannot be made with kwargs={kwargs} ({reason}).") from None
     except error.Error as reason:
         raise QfolioError(f"{id} cannot be made: {_sentence(reason)}") from None
+    except Exception as reason:  # of the environment's own code
+        given = f" with kwargs={kwargs}" if kwargs else ""
+        raise QfolioError(f"{id} cannot be made{given}: {one_line(reason)}.") from reason
 
 
 def _spec(id: str) -> Any:
