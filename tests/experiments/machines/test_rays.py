@@ -50,7 +50,7 @@ def test_a_cluster_that_does_not_answer(address, monkeypatch):
     fake = Mock(is_initialized=lambda: False)
     monkeypatch.setitem(sys.modules, "ray", fake)
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    with pytest.raises(QfolioError, match=r"cannot be reached .*RAY_AUTH_MODE=token"):
+    with pytest.raises(QfolioError, match=r"cluster 127.0.0.1:1 cannot be reached .*=token"):
         rays._connected(address)
     assert not fake.init.called
 

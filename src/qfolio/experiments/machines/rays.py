@@ -168,14 +168,15 @@ def _connected(address: str | None) -> Any:
             'Ray is not installed; install it with pip install "qfolio[ray]".'
         ) from None
     if not ray.is_initialized():
+        named = address or os.environ.get("RAY_ADDRESS", "")
         try:
-            _require_open(address or os.environ.get("RAY_ADDRESS", ""))
+            _require_open(named)
             _connect(ray, address)
         except (OSError, ValueError, RuntimeError) as error:
             lines = str(error).strip().splitlines() or [type(error).__name__]
             why = lines[-1] if isinstance(error, ConnectionAbortedError) else lines[0]
             raise QfolioError(
-                f"The Ray cluster {address or 'of this machine'} cannot be reached "
+                f"The Ray cluster {named or 'of this machine'} cannot be reached "
                 f"({why.rstrip('.')}); check its address, and that it is running. If it asks for "
                 "a token, set RAY_AUTH_MODE=token."
             ) from None
