@@ -9,6 +9,7 @@ import pytest
 
 from qfolio.commands.backtesting import Options
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import figure
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.folder import BacktestFolder
@@ -38,8 +39,15 @@ def test_a_backtest_shows_itself_in_a_notebook(folder):
     assert "Backtest of pathwise" in shown
     measures = json.loads((folder / "summary.json").read_text())["strategies"]
     growth = measures["equal-weight"]["measures"]["growth"]["mean"]
-    assert f"<td>equal-weight</td><td>{100 * growth:.1f}%</td>" in shown
+    assert f"<td>equal-weight</td><td>{figure(growth, '.1%')}</td>" in shown
     assert "equal-weight at" not in shown  # the other speeds of rebalancing
+
+
+def test_a_notebook_shows_a_measure_that_is_none_as_a_dash(folder, monkeypatch):
+    measures = {"growth": -0.05, "sharpe": math.nan, "turnover": 0.0, "drawdown": 0.25}
+    monkeypatch.setattr(BacktestFolder, "read_measures", lambda folder: {"idle": measures})
+    cells = "".join(f"<td>{cell}</td>" for cell in ("idle", "−5.0%", "–", "0.0", "25.0%"))
+    assert cells in Backtest.open(folder)._repr_html_()
 
 
 def test_python_finishes_a_backtest_as_the_command_does(folder, tmp_path):

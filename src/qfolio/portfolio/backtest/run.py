@@ -24,7 +24,7 @@ from qfolio.core.files import locked, new_folder, path_of, tidy
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
 from qfolio.core.registry import BASELINES, own_modules, short
-from qfolio.core.text import amount, near
+from qfolio.core.text import amount, figure, near
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.log import Log
 from qfolio.experiments.machines.choice import on
@@ -307,9 +307,8 @@ class Backtest:
         header, rows = ("a year, net", "growth", "Sharpe", "turnover", "drawdown"), []
         folder = self._kept.folder
         for name, measures in (folder.read_measures() if folder else {}).items():
-            growth, drawdown = (100 * measures[key] for key in ("growth", "drawdown"))
-            cells = (f"{growth:.1f}%", f"{measures['sharpe']:.2f}", f"{measures['turnover']:.1f}")
-            rows.append((name, *cells, f"{drawdown:.1f}%"))
+            forms = {"growth": ".1%", "sharpe": ".2f", "turnover": ".1f", "drawdown": ".1%"}
+            rows.append((name, *(figure(measures[key], form) for key, form in forms.items())))
         return card(f"Backtest of {' and '.join(self.agents)}", facts, header, rows)
 
     @property
