@@ -232,6 +232,16 @@ def test_the_report_says_what_happened(content):
     assert "does not settle" in verdict(content)
 
 
+@pytest.mark.parametrize(("own", "stated"), [(1.0, 0.3), (0.1, 0.1)])
+def test_the_report_states_the_exploration_that_a_renewed_agent_begins_with(content, own, stated):
+    """That of the experiment, or the agent's own if that is less."""
+    plan = dataclasses.replace(PLAN, agent=dataclasses.replace(AGENT, epsilon_start=own))
+    assert isinstance(plan.renewed, DQN)
+    assert plan.renewed.epsilon_start == stated
+    settings = content["agent_settings"] | {"epsilon_start": own}
+    assert f"with ε from {stated}." in render_page(content | {"agent_settings": settings})
+
+
 def test_the_verdict_says_which_way_had_too_few_steps_to_learn(content, tmp_path):
     slow = dataclasses.replace(AGENT, learning_starts=50)
     create(dataclasses.replace(PLAN, agent=slow, renewal=0.1), tmp_path / "run")
