@@ -15,6 +15,7 @@ from qfolio.core.population import Population
 from qfolio.experiments import continual
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.continual import Course, Grades, Plan, compare, create, recovery, renew
+from qfolio.experiments.events import read
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.synthetic.kelly import Kelly
@@ -81,6 +82,15 @@ def test_fresh_is_a_training_in_the_changed_world(content):
     course = content["courses"]["fresh"]
     np.testing.assert_allclose(course["final"], regrets(NEW, trained(NEW, AGENT)), rtol=1e-5)
     assert course["steps"][-1] == EPISODES * 20
+
+
+def test_the_log_says_at_which_step_each_way_ends(tmp_path):
+    create(PLAN, tmp_path)
+    compare(tmp_path)
+    events, _ = read(tmp_path / "events.jsonl")
+    last = {e["job"]: e["step"] for e in events if e["event"] == "record"}
+    assert {e["job"]: e["step"] for e in events if e["event"] == "done"} == last
+    assert last["frozen"] == last["first training"] > 0
 
 
 def test_every_way_begins_with_what_it_knows(content):

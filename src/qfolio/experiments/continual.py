@@ -414,7 +414,7 @@ def _learn(
         if stopped and not training.finished:
             return None, True
     else:
-        job.log.write("done", job=job.name, step=0)
+        job.log.write("done", job=job.name, step=population.steps * population.agent.num_envs)
     final, other = (world.regrets(population, population.starts) for world in (here, there))
     why = unlearned(population.agent, curve.steps[-1]) if anew else ""
     return Course(curve.steps, curve.regrets, final, other, seconds, why), stopped
