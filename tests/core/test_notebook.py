@@ -28,5 +28,5 @@ def test_long_tables_are_cut():
 
 def test_numbers_that_are_none():
     assert [number(x) for x in (None, math.nan, -1234.56, 0.012345)] == [
-        "–", "–", "-1,235", "0.01235",
+        "–", "–", "−1,235", "0.01235",
     ]  # fmt: skip

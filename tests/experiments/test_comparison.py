@@ -17,6 +17,7 @@ from qfolio.agents.ppo import PPO
 from qfolio.commands.progress import JobsProgress
 from qfolio.core.errors import QfolioError
 from qfolio.core.statistics import interquartile_mean
+from qfolio.core.text import figure
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
 from qfolio.experiments.comparison.conclusion import amount, conclusion, share
@@ -283,7 +284,7 @@ def test_a_comparison_shows_itself_in_a_notebook(finished):
     for name in ("slow", "quick"):
         assert f"<td>{name}</td>" in shown
         middle = float(interquartile_mean(content["results"][name]["returns"]))
-        assert f"{middle:,.4g}" in shown
+        assert figure(middle, ",.4g") in shown
 
 
 def test_a_comparison_in_its_folder(finished):

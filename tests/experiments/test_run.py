@@ -18,6 +18,7 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import write_arrays
+from qfolio.core.text import figure
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.ar1 import Ar1
@@ -98,7 +99,7 @@ def test_a_run_shows_itself_in_a_notebook(task, agent, tmp_path):
     shown = run._repr_html_()
     assert "preset &lt;b&gt;" in shown
     assert "<svg" in shown
-    assert f"{run.evaluations[-1]['return']:,.4g}" in shown
+    assert figure(run.evaluations[-1]["return"], ",.4g") in shown
 
 
 def test_steps_say_how_far_as_episodes_do(task, agent, tmp_path):

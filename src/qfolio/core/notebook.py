@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from html import escape
 
-from qfolio.core.text import printable
+from qfolio.core.text import figure, printable
 
 ROWS = 20
 """Most rows of a table; a line says how many more there are."""
@@ -34,8 +34,8 @@ def card(
 
 
 def number(value: float | None) -> str:
-    """Four significant digits; a dash if there is no number."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:,.4g}"
+    """Four significant digits, with a true minus sign; a dash if there is no number."""
+    return "–" if value is None or not math.isfinite(value) else figure(value, ",.4g")
 
 
 def _text(text: str) -> str:
