@@ -279,6 +279,8 @@ def finished(tmp_path_factory):
 
 def test_a_comparison_shows_itself_in_a_notebook(finished):
     run, content = finished
+    wanted = f"2 of 2 agents finished, in {run.folder}>"
+    assert repr(run) == f"<Comparison: slow, quick on pendulum, {run.config.seeds} seeds, {wanted}"
     shown = run._repr_html_()
     assert "2 of 2 agents" in shown
     for name in ("slow", "quick"):

@@ -193,6 +193,12 @@ class Comparison:
         """A comparison as its last finished agent left it."""
         return cls(read_config(Path(folder) / FILE, ComparisonConfig), Path(folder))
 
+    def __repr__(self) -> str:
+        config, seeds = self.config, amount(self.config.seeds, "seed")
+        done = f"{len(self.results)} of {amount(len(self.entrants), 'agent')} finished"
+        names = ", ".join(self.entrants)
+        return f"<Comparison: {names} on {config.task}, {seeds}, {done}, in {self.folder}>"
+
     def _repr_html_(self) -> str:
         config, rows = self.config, []
         for name in self.entrants:
