@@ -22,7 +22,7 @@ from qfolio.core import devices, settings
 from qfolio.core.config import AgentName, Config, agent_folder, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.files import locked, new_folder, read_json
+from qfolio.core.files import locked, new_folder, path_of, read_json
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
 from qfolio.core.statistics import interquartile_mean, regret
@@ -184,14 +184,16 @@ class Comparison:
             },
             **devices.circumstances(),
         )
-        with new_folder(Path(out)) as folder:
+        place = path_of("out", out)
+        with new_folder(place) as folder:
             write_config(folder / FILE, config)
-        return cls(config, Path(out))
+        return cls(config, place)
 
     @classmethod
     def open(cls, folder: Path | str) -> "Comparison":
         """A comparison as its last finished agent left it."""
-        return cls(read_config(Path(folder) / FILE, ComparisonConfig), Path(folder))
+        place = path_of("folder", folder)
+        return cls(read_config(place / FILE, ComparisonConfig), place)
 
     def __repr__(self) -> str:
         config, seeds = self.config, amount(self.config.seeds, "seed")

@@ -24,7 +24,7 @@ from qfolio.core import devices, settings
 from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.files import new_folder, read_json, write_json
+from qfolio.core.files import new_folder, path_of, read_json, write_json
 from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.text import finite
@@ -184,7 +184,7 @@ class Tuning:
         )
         search.require_buildable(type(agent), settings.describe(agent), space)
         jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))  # fits the task?
-        folder = Path(out)
+        folder = path_of("out", out)
         with new_folder(folder, "--join") as unfinished:
             write_config(unfinished / STUDY, config)
         return cls(config, folder)
@@ -197,7 +197,7 @@ class Tuning:
 
         trials: a new total number of configurations. batch: for this process alone.
         """
-        folder = Path(folder)
+        folder = path_of("folder", folder)
         config = read_config(folder / STUDY, SearchConfig)
         if trials is not None:
             _require_counts(trials=trials)

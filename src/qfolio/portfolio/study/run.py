@@ -129,7 +129,7 @@ class Study:
         costs = _charged(costs, options)
         variants = [Variant(int(lag), float(cost)) for lag, cost in itertools.product(lags, costs)]
         _require_plan(tables, variants)
-        studies = [StudyFolder(Path(folder)).read() for folder in after]
+        studies = [StudyFolder(path_of("after", folder)).read() for folder in after]
         looked = (look for study in studies for look in (*study.earlier, *study.looks))
         earlier = list(dict.fromkeys(looked))
         looks = {
