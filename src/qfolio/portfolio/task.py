@@ -242,7 +242,8 @@ class Portfolio(Market):
         if self.tradable is not None and not there[:, usable].all():
             channels = channels[there[:, usable]][:, None]
         with warnings.catch_warnings(action="ignore"):  # of channels that are unknown in all rows
-            center, scale = np.nanmean(channels, (0, 1)), np.nanstd(channels, (0, 1))
+            center = np.nan_to_num(np.nanmean(channels, (0, 1)))
+        scale = np.where(np.isnan(channels), center, channels).std((0, 1))  # as they are observed
         center[0] = 0.0  # returns keep their sign, which is informative
         limits = np.where(usable, self.max_weight, 0.0)
         allowed = _allowed(self.mandate, usable, self.max_weight)
@@ -250,7 +251,7 @@ class Portfolio(Market):
             limits = np.maximum(allowed.limits.high, 0.0)
         return self.having(
             limits=jnp.asarray(limits, jnp.float32),
-            center=jnp.asarray(np.nan_to_num(center), jnp.float32),
+            center=jnp.asarray(center, jnp.float32),
             scale=jnp.asarray(np.where(scale > 0, scale, 1.0), jnp.float32),
             first_decision=jnp.array(first + self.window, jnp.int32),
             last_decision=jnp.array(last - self.lag - 1, jnp.int32),
