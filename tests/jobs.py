@@ -121,8 +121,10 @@ class Tell:
         training = Training(None, Budget(episodes=4), left=7, members=[0], ends=[100])
         for listener in listeners:
             listener.on_start(training)
-            training.left, training.done, training.seconds = 0, 7, 1.0
+            training.left, training.done, training.seconds = 3, 4, 1.0
+            training._learned, training._learning_seconds = 4, 1.0
             listener.on_chunk(training, Records.of([{"seed": 0, "episode": 1, "return": 2.5}]))
+            training.left = 0
             listener.on_end(training)
         return "told"
 

@@ -313,6 +313,25 @@ def test_what_is_observed_has_a_mean_of_0_and_a_deviation_of_1():
     np.testing.assert_array_equal(nowhere.scale[1:], 1)
 
 
+@pytest.mark.parametrize("text", ["market-volatility:252", "market-momentum:252", "momentum:252"])
+@pytest.mark.parametrize("rows", [253, 256, 300])
+def test_a_signal_that_is_known_at_few_rows_is_not_enlarged(text, rows):
+    """The deviation of a few neighbors, or of one, would make later values thousands."""
+    prices = price_table(random_walk(600, 4, volatility=0.02), dates=days(600))
+    task = Portfolio.of(prices, window=1, horizon=1, signals=text).part(0, rows - 1)
+    later = [task.features(jnp.array(row))[..., 1] for row in range(rows, 600)]
+    assert abs(np.array(later)).max() < 10
+
+
+def test_a_constant_has_no_scale():
+    values = random_walk(60, 3)
+    constant = np.full((60, 3, 1), 0.1)
+    prices = price_table(values, dates=days(60), feature_names=("same",), features=constant)
+    task = Portfolio.of(prices, window=1, horizon=1)
+    assert task.scale[1] == 1
+    assert abs(task.features(jnp.array(30))[..., 1]).max() < 1e-4
+
+
 def test_a_column_of_the_table_is_ranked_like_a_signal():
     values = prices()[:, :3]
     column = np.random.default_rng(0).normal(size=values.shape)

@@ -623,6 +623,8 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
         ],
         -1,
     )
+    with pytest.raises(QfolioError, match="do not name|has no rows"):
+        load(frame, members=pd.DataFrame())
     numbered = rows.reset_index()
     numbered.to_csv(tmp_path / "numbered.csv")
     rows.astype(bool).to_csv(tmp_path / "truth.csv")

@@ -41,8 +41,8 @@ def study(
         lags: Further lags, besides --lag, at which to train and test everything (default: none).
         costs_bps: Further costs in basis points, besides --cost-bps; every lag is combined with
             every cost (default: none).
-        after: Folders of earlier studies; their looks at the same tables are counted (default:
-            none).
+        after: Folders of earlier studies; their looks at the same tables are counted, and those
+            of their --trials (default: none).
     """
     import msgspec
 

@@ -52,6 +52,13 @@ Row = Int[Array, ""]
 LEAST = 1e-6
 """Share of an anchor that is spread equally."""
 
+RARE = 0.75
+"""A channel that is unknown at more than this share of rows is not enlarged: the few others say
+little about its scale."""
+
+ROUNDING = 1e-5
+"""A channel whose deviation is less than this share of its mean is constant, up to rounding."""
+
 
 class Portfolio(Market):
     """Trade the assets of a price table; each episode covers ``horizon`` consecutive rows.
@@ -243,7 +250,10 @@ class Portfolio(Market):
             channels = channels[there[:, usable]][:, None]
         with warnings.catch_warnings(action="ignore"):  # of channels that are unknown in all rows
             center = np.nan_to_num(np.nanmean(channels, (0, 1)))
-        scale = np.where(np.isnan(channels), center, channels).std((0, 1))  # as they are observed
+        unknown = np.isnan(channels)
+        scale = np.where(unknown, center, channels).std((0, 1))  # as they are observed
+        rounding, rare = ROUNDING * abs(center), unknown.mean((0, 1)) > RARE
+        scale = np.where(rare, np.maximum(scale, 1.0), np.where(scale > rounding, scale, 1.0))
         center[0] = 0.0  # returns keep their sign, which is informative
         limits = np.where(usable, self.max_weight, 0.0)
         allowed = _allowed(self.mandate, usable, self.max_weight)
@@ -252,7 +262,7 @@ class Portfolio(Market):
         return self.having(
             limits=jnp.asarray(limits, jnp.float32),
             center=jnp.asarray(center, jnp.float32),
-            scale=jnp.asarray(np.where(scale > 0, scale, 1.0), jnp.float32),
+            scale=jnp.asarray(scale, jnp.float32),
             first_decision=jnp.array(first + self.window, jnp.int32),
             last_decision=jnp.array(last - self.lag - 1, jnp.int32),
             allowed=allowed,

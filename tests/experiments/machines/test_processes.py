@@ -111,7 +111,7 @@ def test_listeners_hear_of_trainings_on_workers():
     ((_, result),) = Processes(1).map([Tell("a")], lambda job: [Note()])
     assert result == "told"
     rows = [{"seed": 0, "episode": 1, "return": 2.5}]
-    assert heard == [("start", 0.0, False), (rows, 1.0, 7.0, 0.0), ("end", True, False)]
+    assert heard == [("start", 0.0, False), (rows, 4 / 7, 4.0, 0.75), ("end", True, False)]
 
 
 def test_the_job_of_a_killed_worker_runs_again(tmp_path):

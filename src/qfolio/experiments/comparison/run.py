@@ -433,7 +433,7 @@ def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
 def _measures(result: Result) -> dict[str, float | None]:
     """The measures of a result in the log: interquartile means over seeds, as in the ranking."""
     final, optimum = float(interquartile_mean(result.returns)), result.optimum
-    missed = None if optimum is None else float(regret(final, optimum))
+    missed = None if not optimum else float(regret(final, optimum))
     return {"return": final, "optimum": optimum, "regret": missed}
 
 

@@ -49,6 +49,7 @@ class Outcome:
 
     @classmethod
     def of(cls, returns: ArrayLike, optimum: float | None) -> "Outcome":
+        optimum = optimum or None  # there is no share of zero
         finite = np.asarray(returns, float)
         finite = finite[np.isfinite(finite)]
         best, middle = float(finite.max()), float(np.median(finite))

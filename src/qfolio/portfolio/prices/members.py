@@ -59,7 +59,7 @@ def _require_kind(names: tuple[str, ...]) -> None:
 def _date_column(names: tuple[str, ...]) -> int:
     """The first, unless it has no name, such as row numbers, and another is called date."""
     dated = (j for j, name in enumerate(names) if plain(name) in DATE_NAMES)
-    return 0 if names[0] else next(dated, 0)
+    return next(dated, 0) if names and not names[0] else 0
 
 
 def _of_rows(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.ndarray:

@@ -223,7 +223,7 @@ def _ticks(dim: Dimension, few: bool = False) -> tuple[list[float], list[str]]:
 
 
 def _height_name(data: Sweep) -> str:
-    return "return" if data.summary["optimum_tuned_on"] is None else "regret (smallest at the top)"
+    return "return" if not data.summary["optimum_tuned_on"] else "regret (smallest at the top)"
 
 
 def _height_ticks(axes: Axes, outcome: Outcome) -> None:

@@ -128,9 +128,10 @@ def channels(task: Portfolio) -> Float[Array, "row asset channel"]:
 
 
 def seen_in_test(stretches: Sequence[Stretch]) -> np.ndarray:
-    """All channels on the days of the test, before scaling; 0 where unknown."""
-    days = tested([fold for *_, fold in stretches])
-    return np.nan_to_num(np.asarray(channels(stretches[0].task))[days])
+    """All channels on the days of the test, before scaling; their means where unknown."""
+    task, days = stretches[0].task, tested([fold for *_, fold in stretches])
+    found = np.asarray(channels(task))[days]
+    return np.where(np.isnan(found), np.asarray(task.center), found)
 
 
 def open_to(stretches: Sequence[Stretch]) -> np.ndarray:
