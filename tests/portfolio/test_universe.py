@@ -623,7 +623,7 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
         ],
         -1,
     )
-    with pytest.raises(QfolioError, match="do not name|has no rows"):
+    with pytest.raises(QfolioError, match=r"do not name|has no rows"):
         load(frame, members=pd.DataFrame())
     numbered = rows.reset_index()
     numbered.to_csv(tmp_path / "numbered.csv")
