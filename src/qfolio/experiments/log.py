@@ -100,7 +100,8 @@ class Log:
                 yield self
             except BaseException as error:
                 failed = isinstance(error, Exception)
-                why = {"error": told(error)} if failed and told(error) else {}
+                sentence = told(error) if failed else None
+                why = {"error": sentence} if sentence else {}
                 self.write("end", state="failed" if failed else "stopped", **why, **here)
                 raise
             self.write("end", state=self.state, **here)

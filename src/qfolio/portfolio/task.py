@@ -56,7 +56,7 @@ RARE = 0.75
 """A channel that is unknown at more than this share of rows is not enlarged: the few others say
 little about its scale."""
 
-ROUNDING = 1e-5
+CONSTANT = 1e-5
 """A channel whose deviation is less than this share of its mean is constant, up to rounding."""
 
 
@@ -248,12 +248,7 @@ class Portfolio(Market):
         )[:, usable]
         if self.tradable is not None and not there[:, usable].all():
             channels = channels[there[:, usable]][:, None]
-        with warnings.catch_warnings(action="ignore"):  # of channels that are unknown in all rows
-            center = np.nan_to_num(np.nanmean(channels, (0, 1)))
-        unknown = np.isnan(channels)
-        scale = np.where(unknown, center, channels).std((0, 1))  # as they are observed
-        rounding, rare = ROUNDING * abs(center), unknown.mean((0, 1)) > RARE
-        scale = np.where(rare, np.maximum(scale, 1.0), np.where(scale > rounding, scale, 1.0))
+        center, scale = _center_and_scale(channels)
         center[0] = 0.0  # returns keep their sign, which is informative
         limits = np.where(usable, self.max_weight, 0.0)
         allowed = _allowed(self.mandate, usable, self.max_weight)
@@ -528,6 +523,20 @@ class Portfolio(Market):
         rows = self.log_relatives.shape[0]
         following = lax.dynamic_index_in_dim(self.log_relatives, row + 1, keepdims=False)
         return jnp.where(row + 1 < rows, jnp.exp(following), 1.0)
+
+
+def _center_and_scale(channels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mean and the deviation of each channel, with its mean where it is unknown.
+
+    channels: of shape (row, asset, channel), NaN where unknown.
+    """
+    unknown = np.isnan(channels)
+    with warnings.catch_warnings(action="ignore"):  # of channels that are unknown in all rows
+        center = np.nan_to_num(np.nanmean(channels, (0, 1)))
+    scale = np.where(unknown, center, channels).std((0, 1))
+    rare = unknown.mean((0, 1)) > RARE
+    varied = np.where(scale > CONSTANT * abs(center), scale, 1.0)
+    return center, np.where(rare, np.maximum(scale, 1.0), varied)
 
 
 def _allowed(mandate: str, usable: np.ndarray, most: float) -> Mandated | None:
