@@ -368,8 +368,13 @@ def test_forward_fill_takes_the_last_known_price():
     filled = load(table, missing="forward-fill").values
     np.testing.assert_array_equal(filled[:, 0], [10, 10, 10, 10.75, 11])
     np.testing.assert_array_equal(filled[:, 1], [20, 19.5, 20.25, 20.5, 20.5])
-    (note, *_) = warnings(table, missing="forward-fill")
+    note, last, *_ = warnings(table, missing="forward-fill")
     assert note.message.startswith("filled forward: 3 missing prices; the longest gap is of 'A'")
+    assert note.date == last.date == "2020-01-08"
+    assert last.message == "the last row has no price of 'B', and takes an earlier one"
+    (note, *others) = warnings(table[["A"]], missing="forward-fill")
+    assert note.date == "2020-01-06"  # the latest that was filled
+    assert not any("the last row" in other.message for other in others)
     with pytest.raises(QfolioError, match="the price is missing"):
         load(table)
 
@@ -398,7 +403,7 @@ def test_rows_without_any_number_are_left_out():
     table = frame(A=A, B=[20.0, 20.5, 20.25, 20.5, 19.75])
     table.iloc[[1, 4], :] = np.nan
     assert str(warnings(table)[0]) == (
-        "left out: 2 rows without any number, from 2020-01-03 to 2020-01-08"
+        "2020-01-08: left out: 2 rows without any number, from 2020-01-03 to this date"
     )
     prices = load(table)
     np.testing.assert_array_equal(prices.dates, table.index[[0, 2, 3]].to_numpy())

@@ -4,6 +4,8 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.prices.table import load
 
+from tables import findings
+
 DAYS = [f"2020-01-0{d}" for d in range(1, 9)]
 
 
@@ -59,3 +61,26 @@ def test_what_is_wrong_with_a_series_is_said(tmp_path, text, said):
     rate.write_text(text)
     with pytest.raises(QfolioError, match=said):
         load(table(tmp_path / "prices.csv"), columns=[f"bills={rate}"])
+
+
+@pytest.mark.parametrize(
+    ("months", "said"),
+    [
+        (["2020-03", "2020-04", "2020-05"], []),  # about two months ago
+        (["2019-10", "2019-11", "2019-12", "2020-01"], ["2020-06-29"]),
+        (["2019-10"], []),  # one number for all rows
+    ],
+)
+def test_a_series_that_has_long_ended_is_named(tmp_path, months, said):
+    """On days up to 2020-06-29."""
+    prices = tmp_path / "prices.csv"
+    days = np.datetime64("2020-03-01") + np.arange(121)
+    rows = [f"{day},{100 + i % 7},{50 + i % 3}" for i, day in enumerate(days)]
+    prices.write_text("\n".join(["date,A,B", *rows]))
+    rate = tmp_path / "bills.csv"
+    rate.write_text("\n".join(["date,rate", *(f"{month}-01,0.01" for month in months)]))
+    found = [each for each in findings(prices, "warning", columns=[f"bills={rate}"])
+             if "bills" in each.message]  # fmt: skip
+    assert [each.date for each in found] == said
+    if said:
+        assert found[0].message == "'bills' is still that of 2020-01-01, the last in 'bills.csv'"

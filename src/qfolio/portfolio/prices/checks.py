@@ -10,7 +10,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import near, quote
 from qfolio.portfolio.prices.columns import find_columns
 from qfolio.portfolio.prices.duplicates import check_duplicates
-from qfolio.portfolio.prices.findings import Finding, Findings
+from qfolio.portfolio.prices.findings import Findings
 from qfolio.portfolio.prices.gaps import cash_outs, complete
 from qfolio.portfolio.prices.grid import arrange
 from qfolio.portfolio.prices.layout import Table
@@ -72,7 +72,7 @@ class Choices:
         return {name: file for name, file in pairs}
 
 
-def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Finding]]:
+def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], Findings]:
     """The arguments of ``Prices`` (none if the table has errors), and all findings."""
     findings = Findings()
     features, shared = tuple(choices.features), choices.own_columns

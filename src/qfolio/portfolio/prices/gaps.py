@@ -230,8 +230,17 @@ def _report_filled(grid: Grid, gaps: np.ndarray, findings: Findings) -> None:
     for row in gaps:
         run = (run + 1) * row
         longest = np.maximum(longest, run)
-    j = int(longest.argmax())
+    j, latest = int(longest.argmax()), int(np.flatnonzero(gaps.any(axis=1))[-1])
     findings.warn(
         f"filled forward: {amount(int(gaps.sum()), 'missing price')}; "
-        f"the longest gap is of {quote(grid.assets[j])}, {amount(int(longest[j]), 'row')}",
+        f"the longest gap is of {quote(grid.assets[j])}, {amount(int(longest[j]), 'row')}; "
+        "the latest price is filled on this date",
+        date=day(grid.dates[latest]),
     )
+    if gaps[-1].any():
+        names = listing(grid.assets[j] for j in np.flatnonzero(gaps[-1]))
+        findings.warn(
+            f"the last row has no price of {names}, and takes an earlier one",
+            date=day(grid.dates[-1]),
+            advice="Nobody trades at that price now; fetch the table again if it is late.",
+        )

@@ -163,8 +163,8 @@ def _empty_rows(
     empty = dated & ~some & (moments > moments[dated & some].min())
     if count := int(empty.sum()):
         first, last = day(moments[empty].min()), day(moments[empty].max())
-        when = f"on {first}" if count == 1 else f"from {first} to {last}"
-        findings.warn(f"left out: {amount(count, 'row')} without any number, {when}")
+        when = "" if count == 1 else f", from {first} to this date"
+        findings.warn(f"left out: {amount(count, 'row')} without any number{when}", date=last)
     return empty
 
 

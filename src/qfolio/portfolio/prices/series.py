@@ -6,19 +6,26 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
-from qfolio.portfolio.prices.findings import day, listing
+from qfolio.portfolio.prices.findings import Findings, day, listing
+from qfolio.portfolio.prices.frequency import spacing
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.records import dates_of, in_order, numbers_of
 
+LATE, MISSED = 7.0, 3.0
+"""How old the last number may be: a week, or three times the days that are usual between two."""
 
-def series(source: Any, name: str, dates: np.ndarray) -> np.ndarray:
+
+def series(source: Any, name: str, dates: np.ndarray, findings: Findings) -> np.ndarray:
     """The latest number known at each date, float64 of shape (rows,).
+
+    A warning says so if the numbers end long before the last date.
 
     Args:
         source: A file or a data frame, with a column of dates and one of numbers. Of several, that
             called ``name`` is read. A number holds from its date until the next one.
         name: Name of the series.
         dates: Dates of the price table, ascending, of shape (rows,).
+        findings: Where a warning goes.
 
     Raises:
         QfolioError: The source cannot be read, lacks the column, or begins after the prices.
@@ -45,4 +52,12 @@ def series(source: Any, name: str, dates: np.ndarray) -> np.ndarray:
             )
     except QfolioError as error:
         raise QfolioError(f"The column {quote(name)} from {quote(table.source)}: {error}") from None
+    known = since[order]
+    age = (dates[-1] - known[-1]).astype("m8[s]").astype(np.int64) / 86400.0
+    if len(known) > 1 and age > max(LATE, MISSED * spacing(known)[1]):
+        findings.warn(
+            f"{quote(name)} is still that of {day(known[-1])}, the last in {quote(table.source)}",
+            date=day(dates[-1]),
+            advice="Give the numbers since then, too.",
+        )
     return np.asarray(values[order][latest])

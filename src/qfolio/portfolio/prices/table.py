@@ -19,7 +19,7 @@ from qfolio.core.text import amount, hint, quote
 from qfolio.portfolio.prices import folder, reading
 from qfolio.portfolio.prices.checks import Choices, examine
 from qfolio.portfolio.prices.columns import text_columns
-from qfolio.portfolio.prices.findings import Finding, day
+from qfolio.portfolio.prices.findings import Finding, Findings, day, listing
 from qfolio.portfolio.prices.frequency import periods_per_year
 from qfolio.portfolio.prices.members import membership
 from qfolio.portfolio.prices.series import series
@@ -214,6 +214,22 @@ class Prices:
         columns = [places[name] for name in assets]
         return self._part(slice(None), columns)
 
+    def exactly(self, assets: Sequence[str], whose: str) -> "Prices":
+        """The table of these assets, in this order; raises QfolioError if it has any others.
+
+        whose: what has these assets, for the message.
+        """
+        missing = [name for name in assets if name not in self.assets]
+        unknown = [name for name in self.assets if name not in assets]
+        if missing or unknown:
+            said = [f"lacks {listing(missing)}"] * bool(missing)
+            said += [f"has {listing(unknown)}, which {whose} does not know"] * bool(unknown)
+            raise QfolioError(
+                f"The price table {' and '.join(said)}; it must have the {len(assets)} assets of "
+                f"{whose}, and no others."
+            )
+        return self.select(assets)
+
     def between(self, start: int | None, stop: int | None) -> "Prices":
         """The rows from ``start`` to ``stop`` − 1, as in a slice of Python."""
         return self._part(slice(start, stop), slice(None))
@@ -343,11 +359,11 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
     table = reading.read(source, lambda names: text_columns(names, chosen.date))
     content, findings = examine(table, chosen)
     if joined:  # its rows are not those of any file
-        findings = [replace(finding, row=None) for finding in findings]
+        findings = Findings(replace(finding, row=None) for finding in findings)
     if not content:
         return None, findings
     for name, file in chosen.series.items():
-        numbers = series(file, name, content["dates"])
+        numbers = series(file, name, content["dates"], findings)
         content["market"] = np.column_stack([content["market"], numbers])
         content["market_names"] += (name,)
     levels = choices.get("returns") is not None
