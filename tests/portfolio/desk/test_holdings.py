@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.desk.holdings import read_holdings
+from qfolio.portfolio.desk.holdings import cashed_out, read_holdings
+
+from tables import price_table
 
 ASSETS = ("AAA", "BBB", "NA")
 
@@ -51,6 +54,26 @@ def test_shorts_and_loans_where_they_are_allowed(tmp_path: Path):
 def test_an_overdraft_is_read_although_shorts_are_not_allowed(tmp_path: Path):
     _, cash = read_holdings(write(tmp_path, "asset,shares\nAAA,1\ncash,-7\n"), ASSETS, None)
     assert cash == -7
+
+
+@pytest.mark.parametrize("name", ["BRK-B", "BRK.B", "BRK/B", "BRK B"])
+def test_classes_of_shares_may_be_spelled_as_a_broker_does(tmp_path: Path, name: str):
+    path = write(tmp_path, f"asset,shares\n{name},3\n")
+    assert read_holdings(path, ("AAA", "BRK-B"), None)[0].tolist() == [0, 3]
+    if name not in (both := ("BRK-B", "BRK.B")):
+        with pytest.raises(QfolioError, match="the backtest does not know"):
+            read_holdings(path, both, None)
+    path = write(tmp_path, "asset,shares\nBRK-B,3\nBRK B,1\n")
+    with pytest.raises(QfolioError, match="line 3: 'BRK-B' appears twice"):
+        read_holdings(path, ("AAA", "BRK-B"), None)
+
+
+def test_all_digits_of_shares_that_are_cashed_out_are_shown():
+    listed = np.array([[True, True], [True, False]])
+    prices = price_table(np.ones((2, 2)), listed=listed)
+    _, cash, said = cashed_out(np.array([0.0, 1_234_567.5]), 0.5, prices)
+    assert cash == 1_234_568
+    assert said == ["B is delisted; 1,234,567.5 shares count as 1,234,567.50 in cash."]
 
 
 @pytest.mark.parametrize(

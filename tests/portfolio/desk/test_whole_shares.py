@@ -93,6 +93,26 @@ def test_lots_of_a_mandate_are_traded_whole_and_single_shares_of_a_split_are_the
     assert differ > 10
 
 
+@pytest.mark.parametrize(("held", "lot", "bought"), [(-160, 100, 100), (-10.5, 1, 10), (-3, 1, 3)])
+def test_a_short_position_is_not_bought_long_by_rounding(held, lot, bought):
+    """Its asset should be 0: what is less than a lot remains."""
+    mandate = mandate_text({"trading": {"lot": lot}}, ("A",))
+    policy = Fixed([1.0, 0.0], Proportional(0.0), mandate)
+    table = Prices(np.arange(2).astype("datetime64[D]"), ("A",), np.full((2, 1), 10.0))
+    assert Allocation.of(policy, table, np.array([held]), 1e4).trades.tolist() == [bought]
+
+
+def test_whole_shares_of_lots_that_are_not_whole():
+    mandate = mandate_text({"trading": {"lot": {"A": 0.5, "B": 1.5}}}, ("A", "B"))
+    policy = Fixed([0.01, 0.49, 0.5], Proportional(0.001), mandate)
+    table = Prices(np.arange(2).astype("datetime64[D]"), ("A", "B"), np.array([[6.5, 11.3]] * 2))
+    for whole, lots in ((False, [0.5, 1.5]), (True, [1, 3])):
+        found = Allocation.of(policy, table, np.zeros(2), 1000.0, whole_shares=whole)
+        np.testing.assert_array_equal(found.trades % lots, 0)
+        assert (found.trades > 40).all()
+        assert (found.trades % 1 == 0).all() == whole
+
+
 def test_the_rounding_is_nearly_the_best_of_all():
     """In 9 of 10 accounts it is the best; the distance to the target is 2% longer at most."""
     found = []

@@ -39,7 +39,7 @@ def print_allocation(
             quoted, count = "–", "–"
             if shares:
                 quoted = figure(price, ",.2f" if price >= 1 else ".4g")
-                count = figure(trade, "+,.4g")
+                count = figure(trade, "+,.4g" if abs(trade) < 1000 else "+,.0f")
             rows.append((asset, quoted, *weights, money, count))
     cash = (figure(float(x[0]), ".2%") for x in (held, targets, after))
     print_table(heads, [*rows, ("cash", "", *cash, "", "")])

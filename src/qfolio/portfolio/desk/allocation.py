@@ -3,6 +3,7 @@
 import dataclasses
 import datetime
 import math
+from fractions import Fraction
 from functools import cached_property, partial
 from typing import Any, Protocol, runtime_checkable
 
@@ -125,6 +126,8 @@ class Allocation:
             lot = lots(policy.mandate)
             whole = whole_shares or lot is not None
             trades[(kept & whole) | (reached == held)[1:]] = 0.0
+            if whole_shares and lot is not None:  # the least lot of whole shares: 3 for 1.5
+                lot = np.array([Fraction(str(each)).numerator for each in lot.tolist()], float)
             if whole:
                 ideal = wealth * reached[0]
                 trades = rounded(trades, shares, known, ideal, lambda trades: after(trades)[0], lot)

@@ -8,6 +8,7 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import hint, quote
+from qfolio.portfolio.desk.orders_csv import spelled
 from qfolio.portfolio.prices.cells import CURRENCIES, is_missing, label, not_a_number, numbers
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.table import Prices
@@ -18,6 +19,8 @@ def read_holdings(
     path: Path | None, assets: Sequence[str], capital: float | None, *, debts: bool = False
 ) -> tuple[np.ndarray, float]:
     """Shares of each asset, of shape (assets,), and cash.
+
+    Classes of shares may be spelled as brokers do: BRK B, BRK.B or BRK/B for BRK-B.
 
     Args:
         path: A table with a column of assets (asset, symbol, ticker, …) and one of shares (shares,
@@ -47,7 +50,7 @@ def read_holdings(
     held: dict[str, float] = {}
     for i, cell in enumerate(table.columns[name_column].tolist()):
         where = f"{path}, line {table.first_row + i}"
-        name, amount = label(cell), float(values[i])
+        name, amount = _known(label(cell), assets), float(values[i])
         if not name and is_missing(cells[i]):
             continue
         if name.lower() == CASH:
@@ -65,7 +68,7 @@ def read_holdings(
             raise QfolioError(f"{where}: {not_a_number(cells[i], table.decimal)}.")
         if not math.isfinite(amount) or (amount < 0 and name != CASH and not debts):
             wanted = "a number" if debts or name == CASH else "0 or more: the backtest is long-only"
-            raise QfolioError(f"{where}: {quote(name)} has {amount:g} shares; give {wanted}.")
+            raise QfolioError(f"{where}: {quote(name)} has {amount:,.12g} shares; give {wanted}.")
         held[name] = amount
     if not held:  # an export may have been cut short
         raise QfolioError(f"{path} lists no holdings; leave it out if all is cash.")
@@ -88,10 +91,18 @@ def cashed_out(
     gone = (shares != 0) & ~prices.listed[-1] & (prices.first_rows < len(prices))
     paid = np.where(gone, shares * prices.values[-1], 0.0)
     said = [
-        f"{prices.assets[j]} is delisted; {shares[j]:,g} shares count as {paid[j]:,.2f} in cash."
+        f"{prices.assets[j]} is delisted; {shares[j]:,.12g} shares count as {paid[j]:,.2f} in cash."
         for j in np.flatnonzero(gone)
     ]
     return np.where(gone, 0.0, shares), cash + float(paid.sum()), said
+
+
+def _known(name: str, assets: Sequence[str]) -> str:
+    """The asset of a name that only a broker spells like this; any other name as it is."""
+    if name in assets:
+        return name
+    alike = [asset for asset in assets if spelled(asset, " ") == spelled(name, " ")]
+    return alike[0] if len(alike) == 1 else name
 
 
 def _name_columns(names: tuple[str, ...]) -> set[int]:

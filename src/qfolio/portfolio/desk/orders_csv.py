@@ -77,7 +77,7 @@ def _interactive_brokers(allocation: Allocation, currency: str) -> tuple[list[st
             raise QfolioError(
                 "A basket of Interactive Brokers takes whole shares only; add --whole-shares."
             )
-        symbol = _symbol(allocation.assets[i], " ")
+        symbol = spelled(allocation.assets[i], " ")
         rows.append([side, int(quantity), symbol, "STK", "SMART", currency, "DAY", "MKT", tag])
     return header, rows
 
@@ -94,7 +94,7 @@ def _alpaca(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
         if instruction == "SELL_SHORT" and quantity != int(quantity):
             raise QfolioError("Alpaca sells whole shares short only; add --whole-shares.")
         side = "buy" if instruction.startswith("BUY") else "sell"
-        rows.append([_symbol(allocation.assets[i], "."), quantity, side, "market", "day"])
+        rows.append([spelled(allocation.assets[i], "."), quantity, side, "market", "day"])
     return header, rows
 
 
@@ -114,7 +114,7 @@ def _schwab(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
                 "An order at Schwab takes whole shares only; add --whole-shares, or first trade "
                 f"what is held of {allocation.assets[i]} beyond whole shares."
             )
-        symbol = _symbol(allocation.assets[i], "/")
+        symbol = spelled(allocation.assets[i], "/")
         rows.append([symbol, "EQUITY", instruction, int(quantity), "MARKET", "NORMAL", "DAY"])
     return header, rows
 
@@ -157,7 +157,7 @@ def _legs(allocation: Allocation) -> list[tuple[int, str, float]]:
     return found
 
 
-def _symbol(name: str, mark: str) -> str:
+def spelled(name: str, mark: str) -> str:
     """An asset's name with a broker's mark before the class of a share: BRK-B, BRK.B, BRK/B.
 
     Other letters after a dot stand for an exchange, as in TSCO.L.

@@ -39,7 +39,9 @@ def whole_shares(
         )
         return number * lots
     low, high = np.floor(ideal + EXACT), np.ceil(ideal - EXACT)
-    least = np.minimum(shares + ideal, 0.0)  # a holding is not sold short by rounding
+    turned = (shares < 0) & (shares + ideal < EXACT) & (shares + high > EXACT)
+    high = np.where(turned, np.maximum(low, high - 1), high)  # what is short is not bought long, …
+    least = np.minimum(shares + ideal, 0.0)  # … and a holding not sold short, by rounding
     low = np.where(shares + low < least - EXACT, np.minimum(high, low + 1), low)
     least_cash = min(cash, 0.0)
 
