@@ -91,6 +91,32 @@ def test_an_order_that_exceeds_the_limit_of_turnover_is_not_said_to_be_at_it():
         assert sentence(largest).endswith(last)
 
 
+def test_reasons_are_those_of_the_whole_order(plan):
+    """Also where it is filled over five rows."""
+    prices = planted()
+    stretch = four_folds(prices, mandate={"trading": {"fill": 5}})[-1]
+    policy = Policy(stretch.task, Known("momentum"), jnp.array([0.4, 0.6]), prices.assets)
+    allocation = Allocation.of(policy, prices, np.zeros(ASSETS), 1000.0)
+    found = reasons(policy, prices, allocation)
+    for one, other in zip(found, plan[1], strict=True):
+        assert (one.asset, one.change) == (other.asset, pytest.approx(other.change, abs=1e-5))
+        assert one.drivers[0].weight == pytest.approx(other.drivers[0].weight, abs=1e-5)
+
+
+def test_reasons_know_the_turnover_that_is_left_of_a_year():
+    prices = planted()
+    stretch = four_folds(prices, mandate={"trading": {"turnover_a_year": 0.5}})[-1]
+    policy = Policy(stretch.task, Known("momentum"), jnp.array([0.4, 0.6]), prices.assets)
+    allocation = Allocation.of(policy, prices, np.zeros(ASSETS), 1000.0, spent=0.3)
+    assert allocation.turnover == pytest.approx(0.2, abs=1e-3)
+    largest = reasons(policy, prices, allocation, 0.3)[0]
+    assert largest.bounds == ("the limit of turnover",)
+    assert abs(largest.rest) < 0.2  # and not a sixth of all that there is to be bought in a year
+    assert sum(each.weight for each in largest.drivers) + largest.rest == pytest.approx(
+        largest.change
+    )
+
+
 def test_the_limits_that_a_target_reaches_are_named():
     mandate = {
         "assets": {"cap": 0.4, "floor": {"B": 0.1}},

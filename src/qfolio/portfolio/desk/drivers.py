@@ -54,26 +54,31 @@ class Reason(msgspec.Struct, frozen=True):
     beyond: bool = False  # whether the order exceeds the limit of turnover, as others require
 
 
-def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reason]:
+def reasons(
+    policy: Policy, prices: Prices, allocation: Allocation, spent: float = 0.0
+) -> list[Reason]:
     """The largest changes of weight, and what drives them; empty for a policy with a menu.
+
+    They are those of the whole order, if it is filled over several rows.
 
     Args:
         policy: The policy that was followed.
         prices: The table that it decided on.
         allocation: Its targets.
+        spent: Turnover since the calendar year began, as for ``Allocation.of``.
     """
     if isinstance(policy.task.actions, Discrete):
         return []
     change = (allocation.weights - allocation.held)[1:]
     held = jnp.asarray(allocation.held[None], jnp.float32)
     row = jnp.array([len(prices) - 1], jnp.int32)
-    task = on_table(policy.task, prices)
-    allowed, nearest = _allowed(task, row[0], held[0])
+    task, used = on_table(policy.task, prices).filling(1), jnp.asarray(spent, jnp.float32)
+    allowed, nearest = _allowed(task, row[0], held[0], used)
     required = (np.asarray(nearest, float) - allocation.held)[1:]
     bounds = _bounds(allowed, allocation.weights, allocation.held)
     over = _over(allowed, allocation.weights, allocation.held)
     beyond = bool(over.get("turnover is too high by", 0.0) > VISIBLE)
-    moved = np.asarray(integrated(task, policy.agent, policy.members, row, held)[0])[0]
+    moved = np.asarray(integrated(task, policy.agent, policy.members, row, held, used)[0])[0]
     names = channel_names(policy.task, policy.features)
     found = []
     for i in np.argsort(-abs(change), kind="stable")[:TRADES]:
@@ -86,9 +91,13 @@ def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reas
 
 
 @eqx.filter_jit
-def _allowed(task: Portfolio, row: jax.Array, held: jax.Array) -> tuple[Feasible, jax.Array]:
+def _allowed(
+    task: Portfolio, row: jax.Array, held: jax.Array, spent: jax.Array
+) -> tuple[Feasible, jax.Array]:
     """The weights that may be ordered at a row, and the nearest of them to those held."""
-    allowed = task.feasible_at(row)
+    allowed, left = task.feasible_at(row), task.terms.unspent(task.terms.begin(held, spent))
+    if isinstance(allowed, Mandated) and left is not None:
+        allowed = allowed.spending(left)
     return allowed, allowed.project(held, held)
 
 

@@ -8,6 +8,7 @@ mean over midpoints, and each directional derivative takes one forward pass.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -95,13 +96,14 @@ def integrated_gradients(
 
 @eqx.filter_jit(donate="none")
 def integrated(
-    task: Portfolio, agent: Agent, members: PyTree, rows: Array, held: Array
+    task: Portfolio, agent: Agent, members: PyTree, rows: Array, held: Array, spent: Any = 0.0
 ) -> tuple[
     Float[Array, "day channel asset"], Float[Array, "day asset channel"], Float[Array, "day asset"]
 ]:
     """How far each channel moves weights at some rows, its latest values, and the whole change.
 
-    members: the agents' weights, with a leading seed axis. held: weights held at the rows.
+    members: the agents' weights, with a leading seed axis. held: weights held at the rows. spent:
+    turnover since the calendar year began.
     """
     places = (jnp.arange(STEPS) + 0.5) / STEPS
 
@@ -110,7 +112,7 @@ def integrated(
         features = task.features(row)
 
         def targets(features: Array) -> Array:
-            return answer(task, agent, members, row, features, held)[1:]
+            return answer(task, agent, members, row, features, held, spent)[1:]
 
         def pull(channel: Array) -> Array:
             along = features * (jnp.arange(features.shape[-1]) == channel)

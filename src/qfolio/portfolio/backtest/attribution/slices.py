@@ -16,6 +16,7 @@ latest row.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -125,13 +126,19 @@ def slices(
 
 
 def answer(
-    task: Portfolio, agent: Agent, members: PyTree, row: Array, features: Array, held: Array
+    task: Portfolio,
+    agent: Agent,
+    members: PyTree,
+    row: Array,
+    features: Array,
+    held: Array,
+    spent: Any = 0.0,
 ) -> Float[Array, " entry"]:
     """The target weights at a row with the given features, the mean of all members."""
     asked = task.having(decides=jnp.ones_like(task.decides))  # on any day
     observed = jnp.swapaxes(features * task.scale + task.center, 0, 1)
     seen = Observed.given(asked, observed, row - task.window + 1)
-    holding = seen.hold(held)
+    holding = seen.hold(held, spent)
     view = jax.tree.map(lambda x: x[None], seen.view(row, holding))
 
     def one(weights: PyTree) -> Array:
