@@ -106,6 +106,80 @@ def test_a_price_carried_forward_is_named_although_the_backtest_saw_it_stand(
     assert "(25 rows): perhaps the asset was delisted" in said
 
 
+def test_prices_that_were_filled_forward_are_named(folder, monkeypatch, capsys, tmp_path):
+    newer = write_table(tmp_path / "newer.csv", rows=270, names=("A", "B", "C"))
+    head, *rows = newer.read_text().split()
+    a, b, _, d = rows[-1].split(",")
+    newer.write_text("\n".join([head, *rows[:-2], f"{rows[-2][:10]},,,", f"{a},{b},,{d}"]))
+    options = ["--prices", newer, "--as-of", "2020-09-26", "--capital", 100, "--dry-run"]
+    assert qfolio(monkeypatch, "allocate", folder, *options, "--missing", "forward-fill") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Warning: newer.csv, 2020-09-25: left out: 1 row without any number." in said
+    assert "Warning: newer.csv, 2020-09-26: filled forward: 1 missing price" in said
+    assert "newer.csv, 2020-09-26: the last row has no price of 'B', and takes an earlier" in said
+
+
+def test_holdings_from_before_the_last_orders_are_named(copy, monkeypatch, capsys, tmp_path):
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    newer = write_table(tmp_path / "newer.csv", rows=270)
+    of = ["allocate", copy, "--agent", "equal-weight", "--capital"]
+    stale = "The holdings are those of record 1 before its trades; if these were filled, export"
+    for capital, more, named in (
+        (1000, AS_OF, False), (1000, ["--prices", newer, "--as-of", "2020-09-26"], True),
+        (1001, ["--prices", newer, "--as-of", "2020-09-26"], False),
+    ):  # fmt: skip
+        assert qfolio(monkeypatch, *of, capital, *more) == 0
+        assert (stale in " ".join(capsys.readouterr().out.split())) == named
+
+
+def test_after_its_trades_an_allocation_is_not_made_again(copy, monkeypatch, capsys, tmp_path):
+    """It would take the place of the record that has the trades, and order more of them."""
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    path, holdings = tmp_path / "orders.csv", tmp_path / "holdings.csv"
+    of = ["--agent", "equal-weight", "--orders", path]
+    plan = allocation(copy, monkeypatch, capsys, *of, "--capital", 3000)
+    with path.open() as file:
+        bought = {row["symbol"]: row["quantity"] for row in csv.DictReader(file)}
+    lines = [f"{name},{shares}" for name, shares in bought.items()]
+    holdings.write_text("\n".join(["asset,shares", *lines, "cash,1.5", ""]))
+    held = ["allocate", copy, *AS_OF, "--holdings", holdings]
+    assert qfolio(monkeypatch, *held, *of) == 2
+    assert "those of record 1 of 2020-09-16 after its trades, so that" in capsys.readouterr().err
+    assert not path.exists()
+    assert [record["trades"] for record in records(copy)] == [
+        [row["trade_shares"] for row in plan["assets"]]
+    ]
+    assert qfolio(monkeypatch, *held, *of, "--dry-run") == 0
+    assert qfolio(monkeypatch, *held, "--agent", "momentum") == 0  # what else is wanted is ordered
+    assert "It supersedes record 1 of the same date" in capsys.readouterr().out
+
+
+def test_a_refusal_leaves_no_earlier_orders(folder, monkeypatch, capsys, tmp_path):
+    path = tmp_path / "orders.csv"
+    for more, kept in (([], False), (["--dry-run"], True)):
+        path.write_text("date,symbol\n")
+        assert qfolio(monkeypatch, "allocate", folder, "--capital", 1, "--orders", path, *more) == 2
+        assert "stale" in capsys.readouterr().err
+        assert path.exists() == kept
+
+
+def test_many_shares_are_shown_with_all_digits(folder, monkeypatch, capsys):
+    of = ["--agent", "equal-weight", "--capital", 1e8, "--whole-shares", "--dry-run"]
+    plan = allocation(folder, monkeypatch, capsys, *of)
+    assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *of) == 0
+    printed = capsys.readouterr().out
+    for row in plan["assets"]:
+        assert f" +{row['trade_shares']:,.0f}\n" in printed
+
+
+@pytest.mark.parametrize("command", ["allocate", "follow"])
+def test_options_without_a_table_to_read_are_refused(command, folder, monkeypatch, capsys):
+    options = ["--missing", "forward-fill", "--returns", "percent", "--delisting-haircut", 0.5]
+    assert qfolio(monkeypatch, command, folder, *options) == 2
+    said = "leave out --missing, --delisting-haircut and --returns, or give --prices."
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -195,3 +195,15 @@ def test_rows_that_a_backtest_was_given_later_are_live(folder, tmp_path, monkeyp
     before = follow(Desk.open(copy), later).tested
     assert qfolio(monkeypatch, "backtest", later, "--resume", copy) == 0
     np.testing.assert_array_equal(follow(Desk.open(copy), later).tested, before)
+
+
+def test_the_rows_since_the_first_allocation_are_enough(folder, monkeypatch, capsys, tmp_path):
+    """The policy's window, which nothing is decided on, needs no rows before."""
+    prices, found = table(tmp_path / "later.csv", 335), []
+    for first in (1, 260):
+        lines = prices.read_text().splitlines()
+        prices.write_text("\n".join([lines[0], *lines[first:]]))
+        assert qfolio(monkeypatch, "follow", folder, "--prices", prices, "--json") == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[1]["growth"] == pytest.approx(found[0]["growth"])
+    assert found[1]["benchmark_growth"] == pytest.approx(found[0]["benchmark_growth"])

@@ -63,7 +63,7 @@ def allocate(
             farther apart than a day (default: today).
         update: Update the policy on the new rows first, and store the new version beside the
             earlier ones.
-        orders: Write the trades to this CSV file.
+        orders: Write the trades to this CSV file. One with earlier trades is removed in any case.
         layout: Columns of that file: generic, ib for a basket of Interactive Brokers, or alpaca or
             schwab for the fields of an order in their APIs.
         currency: Currency in that file, where the layout names one.
@@ -74,6 +74,8 @@ def allocate(
         returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
             shares and orders need prices (default: they are prices).
     """
+    if orders is not None and orders.is_file() and reproduce is None and not dry_run:
+        orders.unlink()  # if anything is refused below, none are left that could be sent again
     import msgspec
     import numpy as np
 
@@ -94,6 +96,7 @@ def allocate(
     from qfolio.portfolio.policy import Policy
     from qfolio.portfolio.prices.findings import day
 
+    latest.require_table(prices, returns)
     desk = Desk.open(folder, returns=returns, **latest.reading)
     if reproduce is not None:
         given = {
@@ -167,7 +170,7 @@ def allocate(
         said += f" {orders} has {amount(len(rows[1]), 'order')}."
     trained, why, notes = None, [], []
     if isinstance(followed, Policy):
-        why = reasons(followed, table, allocation)
+        why = reasons(followed, table, allocation, spent)
         trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
     else:
         notes = followed.notes(table)
@@ -233,6 +236,7 @@ def follow(
         raise QfolioError(
             f"--out is {out}, the CSV file; name it *.csv, and the page is written beside it."
         )
+    latest.require_table(prices, returns)
     desk = Desk.open(folder, returns=returns, **latest.reading)
     following = marked(desk, prices, benchmark)
     if prices is not None:

@@ -8,6 +8,8 @@ from tyro.conf import arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from qfolio.commands.arguments import File, Name, Names
+from qfolio.core.errors import QfolioError
+from qfolio.core.text import listed
 
 if TYPE_CHECKING:
     from qfolio.portfolio.prices.table import Prices
@@ -102,7 +104,7 @@ class Latest:
     Args:
         missing: How to treat missing prices.
         ended: How to treat prices that end early: as missing ones, or as a delisting (default:
-            cash-out, if assets come and go in the backtest).
+            cash-out, if assets were delisted in the backtest).
         delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1
             (default: that of the delistings in the backtest).
         members: Table of the assets that may be bought at each date (default: all).
@@ -124,6 +126,17 @@ class Latest:
     def reading(self) -> dict[str, Any]:
         """The options, as ``Desk.open`` takes them."""
         return dict(vars(self))
+
+    def require_table(self, prices: Path | None, returns: str | None) -> None:
+        """Raises QfolioError if there are options, but no table to read with them."""
+        given = {**self.reading, "returns": returns}
+        usual = {**LATEST.reading, "returns": None}
+        names = [f"--{name.replace('_', '-')}" for name in given if given[name] != usual[name]]
+        if prices is None and names:
+            raise QfolioError(
+                "Without --prices, those of the backtest are taken as they were read there; leave "
+                f"out {listed(names)}, or give --prices."
+            )
 
 
 LATEST = Latest()

@@ -240,16 +240,7 @@ class Policy:
 
     def table(self, prices: Any, **options: Any) -> Prices:
         """The prices with the policy's assets in its order; see ``weights``."""
-        table = load(prices, **options)
-        missing = [name for name in self.assets if name not in table.assets]
-        unknown = [name for name in table.assets if name not in self.assets]
-        if missing or unknown:
-            said = [f"lacks {listing(missing)}"] * bool(missing)
-            said += [f"has {listing(unknown)}, which the policy does not know"] * bool(unknown)
-            raise QfolioError(
-                f"The price table {' and '.join(said)}; it must have the {len(self.assets)} "
-                "assets that the policy was trained on, and no others."
-            )
+        table = load(prices, **options).exactly(self.assets, "the policy")
         if table.feature_names != self.features:
             raise QfolioError(
                 f"The price table has {listing(table.feature_names) or 'none'} as further "
@@ -269,7 +260,6 @@ class Policy:
                 f"The price table has {amount(len(table), 'row')}; the policy's signals "
                 f"look back on {looked}, so it needs at least {looked + 1}."
             )
-        table = table.select(self.assets)
         if table.tradable is not None:  # it may hold whichever assets are available
             return table
         # An asset that may be held needs prices in the whole window, the others at its end.

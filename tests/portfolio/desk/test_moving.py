@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
@@ -89,6 +90,49 @@ def test_a_table_without_its_members_is_refused(desk):
     desk = Desk(desk.run, desk.folder, lambda path: (_without_members(int(str(path))), []))
     with pytest.raises(QfolioError, match="--members"):
         desk.table(desk.followed("equal-weight"), Path(str(NOW)))
+
+
+def test_prices_that_may_be_late_are_no_delisting(desk):
+    """D has its last price at row NOW − 6. Five rows without one may be late, six are not."""
+    for rows in (NOW - 4, NOW):
+        with pytest.raises(QfolioError) as error:
+            desk.read(Path(str(rows)))
+        assert str(error.value) == (
+            f"The prices end on {table(rows).dates[-1].astype('M8[D]')}, but earlier those of D "
+            "(2024-05-24); fetch them again or, if the assets were delisted, add --ended cash-out."
+        )
+    assert desk.read(Path(str(NOW + 1))).listed is not None
+    known = Desk(desk.run, desk.folder, desk.inspect, delists=True)
+    followed, prices = desk.followed("equal-weight"), known.read(Path(str(NOW)))
+    allocation = Allocation.of(followed, prices, np.zeros(5), 1000.0)
+    said = known.terms(followed, prices, allocation, 0.0)
+    assert "These assets count as delisted since the backtest: D (2024-05-24)." in said
+
+
+def test_where_only_members_change_a_missing_price_is_an_error(desk, tmp_path):
+    frame = table(FIRST + 5).to_frame()
+    members = pd.DataFrame(1, frame.index[:1], list(ASSETS)).rename_axis("date")
+    path = tmp_path / "latest.csv"
+    frame.to_csv(path)
+    assert len(Desk.open(desk.folder, members=members).read(path)) == FIRST + 5
+    frame.iloc[-1, 0] = np.nan
+    frame.to_csv(path)
+    with pytest.raises(QfolioError, match=r"no prices after 2024-05-23.*\(--ended\)"):
+        Desk.open(desk.folder, members=members).read(path)
+    assert Desk.open(desk.folder, members=members, ended="cash-out").read(path).listed is not None
+
+
+def test_memberships_that_have_ended_are_refused(desk, tmp_path):
+    """They would have everything sold."""
+    path = tmp_path / "latest.csv"
+    table(FIRST + 5).to_frame().to_csv(path)
+    spans = pd.DataFrame({"asset": ASSETS, "from": "2020-01-01", "to": "2024-05-23"})
+    with pytest.raises(QfolioError, match=r"^No asset may be held on 2024-05-24, .* --members\.$"):
+        Desk.open(desk.folder, members=spans).read(path)
+    spans.loc[0, "to"] = None
+    there = Desk.open(desk.folder, members=spans).read(path).members
+    assert there is not None
+    assert there[-1].tolist() == [True, False, False, False, False]
 
 
 def _without_members(rows: int) -> Prices:

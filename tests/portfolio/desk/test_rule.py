@@ -5,14 +5,17 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.baselines.equal_weight import BuyAndHold
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.folds import spell_all
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.follow import follow
+from qfolio.portfolio.desk.rule import Rule
 from qfolio.portfolio.desk.standing import Standing
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
 
 from tables import days, price_table, random_walk
 from tiny import PATHWISE
@@ -79,7 +82,10 @@ def test_an_asset_as_benchmark_gets_everything(desk):
         "They break the mandate (a weight is above its cap by 0.45), and are carried out all the "
         "same, as in the backtest."
     )
-    assert len(desk.followed("60/40").notes(table())) == 1
+    assert desk.followed("60/40").notes(table()) == [
+        "These are the weights of 60/40 of 2020-05-10, its latest up to 2020-06-08 in the "
+        "backtest's copy, which ends on 2020-05-10."
+    ]
 
 
 @pytest.mark.parametrize(("name", "kind"), [("fund", "returns"), ("index", "levels")])
@@ -159,3 +165,30 @@ def test_orders_that_the_lag_leaves_unfilled_are_named(tmp_path, fill, pending):
             desk.record("equal-weight", allocation, known, False)
     unfilled = "lag of 2 rows, the orders of 2020-04-29 are not filled yet"
     assert [rows for rows, text in said.items() if unfilled in text] == pending
+
+
+def test_a_margin_call_reduces_what_a_baseline_would_keep():
+    """The margin calls above 1 / 0.58 = 1.72 times the wealth; the baseline orders nothing."""
+    prices = table()
+    mandate = {
+        "assets": {"cap": 2.0}, "cash": {"min": -1.0}, "exposure": {"gross": 1.7, "margin": 0.58}
+    }  # fmt: skip
+    task = Portfolio.of(prices, mandate=mandate, window=10)
+    rule = Rule(
+        "buy-and-hold", BuyAndHold(), prices.assets, task, train="100d", expanding=True, cap=1.0
+    )
+    for each, gross in ((0.6, 1.7), (0.55, 1.65)):
+        held = {"cash": 1 - 3 * each, "A": each, "B": each, "C": each}
+        assert 1 - rule.weights(prices, held)["cash"] == pytest.approx(gross)
+
+
+def test_prices_that_begin_later_than_a_baseline_looks_back_are_named(desk):
+    """Momentum looks back a year, and the backtest's prices have 160 days."""
+    prices = table().between(30, 160)
+    said = {}
+    for name in ("momentum", "equal-weight"):
+        rule = desk.followed(name)
+        allocation = Allocation.of(rule, prices, np.zeros(3), 1000.0)
+        said[name] = " ".join(desk.terms(rule, prices, allocation, 0.0))
+    assert "begin on 2020-01-31, but momentum looks back to 2020-01-01; give" in said["momentum"]
+    assert "looks back" not in said["equal-weight"]

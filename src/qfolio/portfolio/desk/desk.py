@@ -1,7 +1,7 @@
 """From a run to orders: allocations that the run's ledger records and can reproduce."""
 
 import datetime
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,7 +12,10 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import amount, listed, near, quote
 from qfolio.core.version import __version__
+from qfolio.portfolio import anchors
+from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.folder import BacktestFolder
+from qfolio.portfolio.backtest.folds import latest
 from qfolio.portfolio.backtest.own import Own
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.calendars import band, decision_rows
@@ -22,12 +25,15 @@ from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_d
 from qfolio.portfolio.desk.rule import Ordered, Rule, Untrained
 from qfolio.portfolio.desk.standing import Kind
 from qfolio.portfolio.policy import Policy
-from qfolio.portfolio.prices.findings import Finding, day
-from qfolio.portfolio.prices.frequency import spacing
+from qfolio.portfolio.prices.findings import Finding, day, first_of
+from qfolio.portfolio.prices.frequency import require_alike, spacing
 from qfolio.portfolio.prices.table import Prices, accepted, inspect
 
 SLOW = 6.0
 """Days between the rows of a table from which on a lag of one is no longer the next day."""
+
+LATE = 5
+"""Last rows without a price that may only be late; of more, an asset may be said to be delisted."""
 
 SAME = 1e-6
 """How far reproduced weights may be off: policies decide in float32, which differs by machine."""
@@ -38,13 +44,15 @@ class Desk:
     """A run whose agents, baselines and strategies of the user's own are followed.
 
     inspect: how prices are read, from the options of the command line. findings: what was found on
-    the table that was read last.
+    the table that was read last. delists: whether the user said that prices which end early are
+    those of delisted assets.
     """
 
     run: Backtest
     folder: Path
     inspect: Callable[..., tuple[Prices | None, list[Finding]]] = field(default=inspect)
     findings: list[Finding] = field(default_factory=list)
+    delists: bool = False
 
     @staticmethod
     def open(folder: Path | str, **options: Any) -> "Desk":
@@ -52,14 +60,15 @@ class Desk:
         run = Backtest.open(folder)
         known = {**options, "features": options.get("features") or tuple(run.config.feature_names)}
         known["columns"] = options.get("columns") or tuple(run.config.prices.get("columns", ()))
-        ends = "gap" if run.prices.tradable is None else "cash-out"
+        ends = "gap" if run.prices.listed is None else "cash-out"
         known["ended"] = options.get("ended") or ends
         if known.get("delisting_haircut") is None:
             lost = run.prices.haircut if known["ended"] == "cash-out" else None
             known["delisting_haircut"] = lost or 0.0
         # Policies and baselines look at the last rows only; assets may start at any row before.
         known["late"] = "join"
-        return Desk(run, Path(folder), partial(inspect, **known))
+        delists = options.get("ended") == "cash-out"
+        return Desk(run, Path(folder), partial(inspect, **known), delists=delists)
 
     @property
     def ledger(self) -> Ledger:
@@ -112,6 +121,15 @@ class Desk:
 
     def table(self, followed: Policy | Untrained, prices: Path | None) -> Prices:
         """The prices to decide on (default: those of the backtest)."""
+        return self.run.prices if prices is None else followed.table(self.read(prices))
+
+    def read(self, prices: Path | None) -> Prices:
+        """The latest prices of the backtest's assets (default: those of the backtest).
+
+        Raises:
+            QfolioError: They cannot be read, are of other assets or another frequency, or end too
+                early of some asset; or no asset may be held at their last row.
+        """
         if prices is None:
             return self.run.prices
         read, self.findings = self.inspect(prices)
@@ -121,7 +139,34 @@ class Desk:
                 "The backtest's universe has members that change over time; give the latest "
                 "memberships with --members."
             )
-        return followed.table(table)
+        table = table.exactly(self.run.prices.assets, "the backtest")
+        require_alike(table.dates, self.run.prices.periods_per_year, "the backtest has")
+        self._require_last_prices(table)
+        if (there := table.tradable) is not None and not there[-1].any():
+            raise QfolioError(
+                f"No asset may be held on {day(table.dates[-1])}, so that all would be sold; give "
+                "the latest memberships with --members."
+            )
+        return table
+
+    def _require_last_prices(self, table: Prices) -> None:
+        """Raises QfolioError if prices may be late, unless the user said that assets ended."""
+        listed, ended = table.listed, self._ended(table)
+        late = [] if listed is None else [j for j in ended if listed[-1 - LATE :, j].any()]
+        if late and not self.delists:
+            raise QfolioError(
+                f"The prices end on {day(table.dates[-1])}, but earlier those of "
+                f"{_with_ends(table, late)}; fetch them again or, if the assets were delisted, add "
+                "--ended cash-out."
+            )
+
+    def _ended(self, table: Prices) -> list[int]:
+        """The assets that were there at the backtest's end and are no more at a table's."""
+        if table.listed is None:
+            return []
+        before = self.run.prices.listed
+        there = True if before is None else before[-1]
+        return np.flatnonzero(there & ~table.listed[-1]).tolist()
 
     @property
     def news(self) -> list[Finding]:
@@ -173,7 +218,8 @@ class Desk:
     ) -> list[str]:
         """Sentences on when and how the backtest and its mandate would trade an allocation."""
         trading = followed.task.written.trading
-        said = self._timing(followed, table, allocation)
+        given = followed, table, allocation
+        said = [*self._doubts(*given), *self._timing(*given)]
         if allocation.trades.any():
             said += [*waiting(table, self.run.config.lag), *self._pending(table)]
         if trading.fill > 1:
@@ -188,6 +234,29 @@ class Desk:
                 f"used {spent:.1%} this year, and this one uses {allocation.turnover:.1%}."
             )
         return said
+
+    def _doubts(
+        self, followed: Policy | Untrained, table: Prices, allocation: Allocation
+    ) -> Iterator[str]:
+        """What an order rests on and the user may know better."""
+        if ended := self._ended(table):
+            yield f"These assets count as delisted since the backtest: {_with_ends(table, ended)}."
+        dates = self.run.prices.dates
+        known = np.concatenate([dates[dates < table.dates[0]], table.dates])
+        what, rows = lookback(followed, known, table.month)
+        if rows > len(table):
+            yield (
+                f"The prices begin on {day(table.dates[0])}, but {what} looks back to "
+                f"{day(known[-rows])}; give them from there on, as the backtest has them, or the "
+                "orders may differ from those that it would give."
+            )
+        before = [record for record in self.ledger.current() if record.moment < table.dates[-1]]
+        held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
+        if before and any(before[-1].trades) and before[-1].digests["holdings"] == held:
+            yield (
+                f"The holdings are those of record {before[-1].number} before its trades; if these "
+                "were filled, export the holdings again."
+            )
 
     def _pending(self, table: Prices) -> list[str]:
         """Says so if parts of earlier orders are filled between the last row and its trade."""
@@ -329,6 +398,35 @@ class Desk:
                 raise QfolioError(f"{path} is missing; restore it.")
             found["policy"] = file_digest(path)
         return found
+
+
+def lookback(followed: Policy | Untrained, dates: np.ndarray, month: int) -> tuple[str, int]:
+    """What of a strategy's estimates looks back on most rows of a table, and on how many.
+
+    A policy's signals are not counted: it needs the rows that they look back on.
+    """
+    found = {"": 0}
+    task = followed.task
+    if isinstance(followed, Rule) and followed.baseline.estimates:
+        train = latest("", dates, followed.train, followed.expanding).train
+        months, least = followed.baseline.months, getattr(followed.baseline, "least", 0)
+        window = len(dates) if months is None else max(months * month, least) + 1
+        found[followed.name] = min(window, train.stop - train.start)
+    if any(baseline(name).estimates for name in anchors.baselines(task.anchor)):
+        found["the agent's anchor"] = (anchors.MONTHS + 1) * month  # it decides once a month
+    risk = task.written.risk
+    limited = risk.volatility is not None or risk.tracking_error is not None
+    if limited and not isinstance(followed, Ordered):
+        found["the mandate's limit on risk"] = risk.rows + 1
+    what = max(found, key=found.__getitem__)
+    return what, min(found[what], len(dates))
+
+
+def _with_ends(table: Prices, which: list[int]) -> str:
+    """Assets that ended, each with the date of its last price."""
+    assert table.listed is not None
+    ends = {j: table.dates[np.flatnonzero(table.listed[:, j])[-1]] for j in which}
+    return first_of(f"{table.assets[j]} ({day(end)})" for j, end in ends.items())
 
 
 def waiting(prices: Prices, lag: int) -> list[str]:

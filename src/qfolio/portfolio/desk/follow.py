@@ -209,7 +209,7 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
         )
     agent, lag = records[-1].agent, run.config.lag
     known = desk.followed(agent, records[-1].policy)
-    table = desk.table(known, prices)
+    table = desk.read(prices)
     fills = [desk.fill(record.agent) for record in records]
     live = mark(records, table, known.costs, lag, fills, known.task.terms.band)
     other, count = run.config.benchmark, len(live.returns)

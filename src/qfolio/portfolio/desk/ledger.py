@@ -132,6 +132,9 @@ class Ledger:
 
         Returns:
             The record, and a sentence that says what was done.
+
+        Raises:
+            QfolioError: The trades of the last record of the same date have been made.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with locked(self.folder):
@@ -140,6 +143,12 @@ class Ledger:
             before = next((r for r in reversed(records) if r.date == content["date"]), None)
             if before is not None and not (differing := _differing(before, content)):
                 return before, f"This allocation is already record {before.number} of the ledger."
+            if before is not None and differing == ["holdings"] and _traded(before, content):
+                raise QfolioError(
+                    f"The holdings are those of record {before.number} of {before.date} after its "
+                    "trades, so that nothing more is ordered on these prices; allocate on later "
+                    "ones, or look with --dry-run."
+                )
             record = msgspec.convert(
                 {
                     **content,
@@ -251,6 +260,12 @@ def _inputs(record: Record | dict[str, Any]) -> dict[str, Any]:
     names = ("prices", "policy", "settings", "holdings")
     digests = {name: content["digests"].get(name) for name in names}
     return {"agent": content["agent"], **digests, "rounding": content["whole_shares"]}
+
+
+def _traded(before: Record, content: dict[str, Any]) -> bool:
+    """Whether holdings are those of a record after its trades; prices and fees decide on cash."""
+    after = np.add(before.shares, before.trades)
+    return any(before.trades) and np.allclose(content["shares"], after, rtol=1e-9, atol=1e-5)
 
 
 def _differing(before: Record, content: dict[str, Any]) -> list[str]:

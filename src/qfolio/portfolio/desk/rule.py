@@ -41,15 +41,9 @@ class Untrained(abc.ABC):
 
     def table(self, prices: Any, **options: Any) -> Prices:
         """The prices with the assets of the backtest, in its order."""
-        table = load(prices, **options)
-        if set(table.assets) != set(self.assets):
-            off = sorted(set(table.assets) ^ set(self.assets))
-            raise QfolioError(
-                f"The price table must have the {len(self.assets)} assets of the backtest, and no "
-                f"others; {off[0]!r} is in only one of the two."
-            )
+        table = load(prices, **options).exactly(self.assets, "the backtest")
         require_alike(table.dates, float(self.task.year), "the backtest has")
-        return table.select(self.assets)
+        return table
 
     @abc.abstractmethod
     def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:
@@ -85,7 +79,7 @@ class Rule(Untrained):
         self.baseline, self.train, self.expanding = baseline, train, expanding
 
     def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:
-        """The baseline's target, or the holdings if it gives no order."""
+        """The baseline's target; without one, the holdings, which a margin call reduces."""
         table = self.table(prices)
         held = np.array([(holdings or {"cash": 1.0}).get(n, 0.0) for n in ("cash", *self.assets)])
         fold = latest("latest", table.dates, self.train, self.expanding).complete(table.values)
@@ -112,6 +106,8 @@ class Rule(Untrained):
         open_to = holdable(tradable, mandated)
         history = History(table.dates, table.values, fold.train, open_to, cap, table.month)
         wanted = ask(self.name, self.baseline, history, held, mandated)
+        if wanted is None and terms.calls(held):
+            wanted = held  # as in the backtest
         target = held
         if wanted is not None:
             target = obeying(wanted, held, mandated)
@@ -158,6 +154,9 @@ class Ordered(Untrained):
         latest, last = self._latest(table), day(table.dates[-1])
         ordered = day(self.own.dates[latest])
         said = [f"These are the weights of {self.name} of {ordered}, its latest up to {last}."]
+        if self.name not in self.assets:  # which is bought once
+            ends = day(self.own.dates[-1])
+            said = [f"{said[0][:-1]} in the backtest's copy, which ends on {ends}."]
         if self.mandate:
             there = ~np.isnan(table.values[-1])
             mandated, _ = checks.relaxed(feasible(self.mandate, there, self.cap))

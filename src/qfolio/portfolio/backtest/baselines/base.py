@@ -58,10 +58,12 @@ class Baseline(ABC):
             holding drifts in between. "row": at every row; None then lets the holding drift.
         estimates: Whether ``decide`` reads past prices. If not, it may hold any asset that is
             available at the decision, where assets come and go.
+        months: Latest months that it reads (default: the training window and all rows since).
     """
 
     calendar: ClassVar[Calendar] = "fold"
     estimates: ClassVar[bool] = True
+    months: ClassVar[int | None] = None
 
     @abstractmethod
     def decide(self, history: History, held: Floats) -> Floats | None:
@@ -85,12 +87,10 @@ class Fitted(Baseline):
     assets to hold everything, all are at the cap and the rest is cash.
 
     Attributes:
-        months: The window of the estimate (default: the training window and all rows since).
         least: Number of returns that the window has at least, if there are so many.
     """
 
     calendar = "month"
-    months: ClassVar[int | None] = None
     least: ClassVar[int] = 0
 
     @abstractmethod

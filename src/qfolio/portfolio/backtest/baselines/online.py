@@ -25,7 +25,7 @@ FEWEST = 5
 class Online(Baseline):
     """A rule that starts with equal weights and takes a step at every row."""
 
-    calendar = "row"
+    calendar, months = "row", 1
 
     @abstractmethod
     def step(self, target: Floats, prices: Floats) -> Floats:

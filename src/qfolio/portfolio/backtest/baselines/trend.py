@@ -15,10 +15,10 @@ class Momentum(Baseline):
     would leave cash, more assets are held.
     """
 
-    calendar = "month"
+    calendar, months = "month", 12
 
     def decide(self, history: History, held: Floats) -> Floats:
-        prices = history.window(12)
+        prices = history.window(self.months)
         if len(prices) < history.month + 2:
             return with_cash(equal_weights(history), history)
         rose = prices[-1 - history.month] / prices[0]
@@ -34,9 +34,9 @@ class Trend(Baseline):
     M. Faber, "A Quantitative Approach to Tactical Asset Allocation" (2007).
     """
 
-    calendar = "month"
+    calendar, months = "month", 10
 
     def decide(self, history: History, held: Floats) -> Floats:
-        prices = history.window(10)[1:]
+        prices = history.window(self.months)[1:]
         rising = prices[-1] > prices.mean(axis=0)
         return with_cash(equal_weights(history) * rising, history)
