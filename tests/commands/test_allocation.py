@@ -505,6 +505,15 @@ def test_orders_as_csv(folder, monkeypatch, capsys, tmp_path):
     assert "--layout is 'x'; choose from generic, ib, alpaca, schwab" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--prices", "--holdings"])
+def test_orders_do_not_replace_an_input(option, folder, monkeypatch, capsys, tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("asset,shares\ncash,1\n")
+    assert qfolio(monkeypatch, "allocate", folder, option, path, "--orders", path) == 2
+    assert f"{option} and --orders name one file" in capsys.readouterr().err
+    assert path.exists()
+
+
 def test_orders_that_cannot_be_written_are_not_recorded(copy, monkeypatch, capsys, tmp_path):
     shutil.rmtree(copy / "ledger", ignore_errors=True)
     of = ["--agent", "equal-weight", "--capital", 1000, "--orders"]

@@ -74,8 +74,12 @@ def allocate(
         returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
             shares and orders need prices (default: they are prices).
     """
-    if orders is not None and orders.is_file() and reproduce is None and not dry_run:
-        orders.unlink()  # if anything is refused below, none are left that could be sent again
+    if orders is not None:
+        for option, file in {"--prices": prices, "--holdings": holdings}.items():
+            if file is not None and file.resolve() == orders.resolve():
+                raise QfolioError(f"{option} and --orders name one file; give orders their own.")
+        if orders.is_file() and reproduce is None and not dry_run:
+            orders.unlink()  # if anything is refused below, none are left that could be sent again
     import msgspec
     import numpy as np
 
