@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import msgspec
 import numpy as np
@@ -131,6 +132,21 @@ def test_a_table_whose_summary_is_lost_can_be_written_again(finished):
             finished.result()
     finally:
         (place / "lost.json").rename(place / "summary.json")
+
+
+def test_a_backtest_that_has_gone_on_beyond_its_table_is_not_pooled(finished, tmp_path):
+    folder = tmp_path / "study"
+    shutil.copytree(finished.folder, folder)
+    returns = Study.open(folder).backtest("one").folder / "returns.csv"
+    summary = returns.with_name("summary.json")
+    content = json.loads(summary.read_text())
+    day = str(TABLES["one"].dates[-1].astype("datetime64[D]") + 1)
+    with returns.open("a") as file:
+        file.write(",".join([day, *returns.read_text().splitlines()[-1].split(",")[1:]]) + "\n")
+    summary.write_text(json.dumps({**content, "periods": content["periods"] + 1}))
+    with pytest.raises(QfolioError, match=f"has gone on to {day}, but the study's table one ends"):
+        Study.open(folder).result()
+    assert Study.open(folder).config.result == finished.config.result
 
 
 def test_looks_are_counted_and_inherited(finished, tmp_path):

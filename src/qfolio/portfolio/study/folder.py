@@ -5,7 +5,7 @@ row for each table, variant and agent), the report, and an ordinary backtest for
 variant in tables/TABLE/VARIANT/.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -140,14 +140,22 @@ class StudyFolder:
         """The folder of a table's backtests."""
         return self.path / "tables" / table
 
-    def read_returns(self, table: str, variant: Variant, agents: Iterable[str]) -> TableReturns:
+    def read_returns(self, table: str, variant: Variant, config: StudyConfig) -> TableReturns:
         """The returns of a finished backtest.
 
         Raises:
-            QfolioError: returns.csv or summary.json is missing or damaged.
+            QfolioError: returns.csv or summary.json is missing or damaged, or the backtest has gone
+                on beyond the study's table.
         """
         files = BacktestFolder(self.place(table, variant))
         days, columns = files.read_returns()
+        last = config.tables[table].last
+        if days and np.datetime64(days[-1]) > np.datetime64(last):
+            raise QfolioError(
+                f"{files.path} has gone on to {days[-1]}, but the study's table {table} ends on "
+                f"{last}; start a study of the longer table in another folder (--after "
+                f"{shell(self.path)})."
+            )
         try:
             summary = read_json(files.path / "summary.json")
             kinds = {name: entry["kind"] for name, entry in summary["strategies"].items()}
@@ -156,7 +164,7 @@ class StudyFolder:
             return TableReturns(
                 tuple(days),
                 float(summary["periods_per_year"]),
-                {agent: _traded(agent, columns) for agent in agents},
+                {agent: _traded(agent, columns) for agent in config.agents},
                 {reference: columns[reference], **_of_kind("rebalancing", kinds, columns)},
                 baselines,
                 None if RISK_FREE in kinds else columns.get(RISK_FREE),

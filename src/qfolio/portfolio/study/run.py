@@ -296,7 +296,7 @@ class Study:
     def result(self) -> Result:
         """The pooled evidence; writes it into study.json and study.csv.
 
-        Raises QfolioError if a backtest is not finished.
+        Raises QfolioError if a backtest is not finished, or has gone on beyond its table.
         """
         config = self.config
         if not self._complete:
@@ -307,10 +307,7 @@ class Study:
         result = summarize(
             config,
             [
-                {
-                    name: self._files.read_returns(name, each, config.agents)
-                    for name in config.tables
-                }
+                {name: self._files.read_returns(name, each, config) for name in config.tables}
                 for each in config.variants
             ],
         )
