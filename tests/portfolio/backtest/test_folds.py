@@ -9,6 +9,7 @@ from qfolio.portfolio.backtest.folds import (
     latest,
     overdue,
     parse_length,
+    require_fold,
     spell,
     spell_all,
     walk_forward,
@@ -56,6 +57,23 @@ def test_a_year_of_last_trading_days_has_all_its_months(months, rows):
     lengths = [fold.days for fold in folds]
     assert lengths == [rows] * 35
     assert {fold.train.stop - fold.train.start for fold in folds[1:]} == {5 * rows + 1}
+
+
+@pytest.mark.parametrize("test", ["1m", "3m", "1y", "2y"])
+@pytest.mark.parametrize("months", [1, 3, 12])
+@pytest.mark.parametrize("offset", [-1, 0, 14])  # the last day of trading, the first, the 15th
+def test_a_whole_fold_of_months_is_one_whatever_their_length(offset, months, test):
+    """Walking forward, the next fold begins right after it."""
+    following = np.datetime64("1983-02") + np.arange(0, 80 * months, months).astype("m8[M]")
+    dates = np.busday_offset(following.astype("M8[D]") + max(offset, 0), min(offset, 0), "forward")
+    for first in range(12):
+        some = dates[first:]
+        fold = walk_forward(some, "3y", test, 0)[0]
+        end = fold.decisions.stop + 1  # the row after its last return
+        require_fold(some[:end], "3y", test, 0)
+        if fold.days > 1:
+            with pytest.raises(QfolioError, match="fewer than train=3y and one fold of test="):
+                require_fold(some[: end - 1], "3y", test, 0)
 
 
 @pytest.mark.parametrize(
@@ -128,5 +146,6 @@ def test_all_dates_of_a_long_table_are_spelled_at_once() -> None:
 
 
 def test_training_is_longer_than_the_lag():
-    with pytest.raises(QfolioError, match="shorter than the lag"):
-        walk_forward(DAYS, "3d", "1y", 3)
+    for train, lag in (("3d", 3), ("1d", 0)):
+        with pytest.raises(QfolioError, match=f"fewer than two rows .* with a lag of {lag};"):
+            walk_forward(DAYS, train, "1y", lag)

@@ -123,6 +123,19 @@ def changed(**columns):
     return dataclasses.replace(table(), **columns)
 
 
+def test_rows_that_move_the_folds_are_refused():
+    """A second row in the last month, so that lengths do not count months any more."""
+    following = np.datetime64("2000-02") + np.arange(ROWS).astype("m8[M]")
+    dates = np.busday_offset(following.astype("M8[D]"), -1, roll="forward")
+    months = changed(dates=dates).between(0, FIRST)
+    dates[FIRST] = dates[FIRST - 1] + 2
+    options = {"train": "5y", "test": "1y", "seeds": 1, "baselines": ()}
+    run = Backtest.create(months, {"pathwise": AGENT}, **options)
+    message = r"folds begin on other dates \(first: \d+-\d+-\d+, now .*\); start a new backtest"
+    with pytest.raises(QfolioError, match=message):
+        run.extended(changed(dates=dates).between(0, FIRST + 1))
+
+
 SECOND = np.timedelta64(1, "s")
 
 

@@ -248,6 +248,8 @@ def test_short_tables_are_left_out_with_a_reason(tmp_path):
     part = create(tmp_path / "part", {**TABLES, "short": short})
     assert list(part.config.tables) == ["one", "two"]
     assert "are fewer than train=80d and one fold of test=40d" in part.config.left_out["short"]
+    part = create(tmp_path / "few", {**TABLES, "short": table(3, rows=84)}, test="4d")
+    assert "leave 4 rows to test after train=80d, fewer than 5" in part.config.left_out["short"]
     with pytest.raises(QfolioError, match="short is too short: 100 rows"):
         create(tmp_path / "none", {"short": short})
     assert not (tmp_path / "none").exists()

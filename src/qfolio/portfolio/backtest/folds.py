@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from qfolio.core.errors import QfolioError, TooFewRowsError
+from qfolio.core.text import amount
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 
@@ -75,7 +76,8 @@ def walk_forward(
         begin = 0 if expanding else recent
         if first - begin < 1:
             raise TooFewRowsError(
-                f"train={train} is shorter than the lag of {lag}; make it longer."
+                f"train={train} leaves fewer than two rows up to the first decision with a lag of "
+                f"{lag}; make it longer."
             )
         decisions = slice(first, end - lag - 1)
         name = spell(dates[start], dates).replace(" ", "-").replace(":", "")  # of a folder
@@ -106,12 +108,26 @@ def require_fold(dates: np.ndarray, train: str, test: str, lag: int) -> None:
     if unit == "d":
         whole = start + count <= len(dates)
     else:
-        grace = max(np.timedelta64(7, "D"), np.median(np.diff(dates)))
-        whole = dates[-1] + grace >= _shift(dates[start], count, unit)
+        counted = _counted(dates, unit)
+        gap, week = np.median(np.diff(counted)), np.timedelta64(7, "D")
+        # Months are not equally long.
+        grace = gap + np.timedelta64(3, "D") if gap > week else week
+        whole = counted[-1] + grace >= _shift(counted[start], count, unit)
     if not whole:
         raise TooFewRowsError(
             f"{len(dates)} rows, {day(dates[0])} to {day(dates[-1])}, are fewer than "
             f"train={train} and one fold of test={test}; shorten them, or give more rows."
+        )
+
+
+def require_tested(dates: np.ndarray, train: str, least: int) -> None:
+    """Raises QfolioError unless a table has some number of rows or more after those for training."""
+    count = len(dates) - _after(dates, 0, train)
+    if count < least:
+        raise TooFewRowsError(
+            f"{len(dates)} rows, {day(dates[0])} to {day(dates[-1])}, leave {amount(count, 'row')} "
+            f"to test after train={train}, fewer than {least}; shorten it (--train), or give more "
+            "rows."
         )
 
 

@@ -144,12 +144,13 @@ class Plan:
 
     def require_begins_with(self, folds: Sequence[Fold]) -> None:
         """Raises QfolioError unless its first folds are those of a table before it grew."""
-        before = [fold.name for fold in folds]
-        if [fold.name for fold in self.folds[: len(before)]] != before:
-            raise QfolioError(
-                "The new rows are less than a day apart and the earlier ones are not; start a new "
-                "backtest."
-            )
+        names = [*(fold.name for fold in self.folds), "none"]
+        for before, now in zip(folds, names, strict=False):
+            if before.name != now:
+                raise QfolioError(
+                    f"With the new rows, folds begin on other dates (first: {before.name}, now "
+                    f"{now}); start a new backtest."
+                )
 
     @property
     def _latest(self) -> str:

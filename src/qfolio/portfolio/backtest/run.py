@@ -39,7 +39,7 @@ from qfolio.portfolio.backtest.folder import (
     BacktestConfig,
     BacktestFolder,
 )
-from qfolio.portfolio.backtest.folds import fewest, walk_forward
+from qfolio.portfolio.backtest.folds import fewest, require_tested, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow
 from qfolio.portfolio.backtest.own import Own, place
@@ -205,6 +205,7 @@ class Backtest:
         if limits is not None:
             limits = tracked(limits, terms.benchmark, field, prices)
         rows = fewest(walk_forward(prices.dates, train, test, int(lag), expanding), prices)
+        require_tested(prices.dates, train, 2)  # for statistics
         config = BacktestConfig(
             prices=describe(prices),
             assets=list(prices.assets),

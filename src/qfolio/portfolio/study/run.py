@@ -37,11 +37,12 @@ from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.folder import MOST_TRIALS
-from qfolio.portfolio.backtest.folds import parse_length, require_fold
+from qfolio.portfolio.backtest.folds import parse_length, require_fold, require_tested
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
+from qfolio.portfolio.backtest.statistics.estimates import SHORTEST
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
 from qfolio.portfolio.prices.table import Prices, describe, load
 from qfolio.portfolio.study.folder import (
@@ -93,8 +94,8 @@ class Study:
     ) -> "Study":
         """A study before its first backtest.
 
-        Tables that are too short for one whole fold, or for an agent's window and episodes, are
-        left out (``config.left_out`` says why).
+        Tables that are too short for one whole fold, a test of ``SHORTEST`` rows, or an agent's
+        window and episodes are left out (``config.left_out`` says why).
 
         Args:
             tables: Price tables by name, or anything else that ``load_prices`` reads; names become
@@ -143,6 +144,7 @@ class Study:
                 with of_table(name):
                     try:
                         require_fold(table.dates, train, test, max(lags, default=1))
+                        require_tested(table.dates, train, SHORTEST)
                         for variant in variants:
                             Backtest.create(
                                 table,
