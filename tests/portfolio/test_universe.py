@@ -15,7 +15,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Discrete, Position, Transition
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.anchors import path
-from qfolio.portfolio.backtest.baselines import baseline
+from qfolio.portfolio.backtest.baselines import Baseline, History, baseline
 from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import AT_EVERY_ROW, orders
 from qfolio.portfolio.backtest.replay import Replay
@@ -244,6 +244,31 @@ def test_equal_weights_are_spread_over_what_is_there() -> None:
     weights = jax.vmap(anchored.anchor_weights)(jnp.arange(60))
     assert weights is not None
     np.testing.assert_allclose(weights, equal, atol=1e-6)
+
+
+def test_once_a_fold_is_a_new_target_only_where_assets_come_or_go() -> None:
+    class Fastest(Baseline):
+        """All in what rose most since the table began."""
+
+        def decide(self, history: History, held: np.ndarray) -> np.ndarray:
+            asked.append(len(history.prices) - 1)
+            rose = np.where(history.tradable, history.prices[-1] / history.prices[0], 0)
+            return np.append(0.0, rose == rose.max())
+
+    folds = [Fold("one", slice(0, 20), slice(20, 35), slice(0, 20)),
+             Fold("two", slice(0, 35), slice(35, 59), slice(0, 35))]  # fmt: skip
+    values, every = random_walk(60, 3), np.ones((60, 3), bool)
+    gone = every.copy()
+    gone[45:, int((values[35] / values[0]).argmax())] = False
+    found = []
+    for universe, expected in ((None, [20, 35]), (every, [20, 35]), (gone, [20, 35, 45])):
+        asked: list[int] = []
+        given = orders("own", Fastest(), folds, weekdays(60), values, universe=universe)
+        found.append(given.decisions)
+        assert asked == expected
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0][:25], found[2][:25])  # what leaves later is not known
+    assert (found[2][25:] != found[0][25:]).any(axis=1).all()
 
 
 def test_signals_rank_those_that_are_there() -> None:

@@ -69,7 +69,7 @@ def orders(
         universe: Which assets may be bought at each row, of shape (rows, N), if they come and go
             (default: those with prices in all of the fold's training rows). A baseline that
             estimates may hold only those of them with prices in all of these rows. With the
-            calendar "fold", it then decides at every row.
+            calendar "fold", it then decides anew where they have changed, too.
         costs: What holding costs and earns (default: nothing), as in the replay, so that a margin
             call or a band comes at the same row for baselines as for agents.
         conditions: What the costs read at each row, and which assets are listed; holdings of
@@ -91,7 +91,7 @@ def orders(
     decided = tested(folds)
     first = decided.start
     account = _Account(growth, terms, universe, first)
-    asks, gives = _calendar(baseline, folds, len(prices), month, terms, universe is not None)
+    asks, gives = _calendar(baseline, folds, len(prices), month, terms, universe)
     decisions, notes = np.full((decided.stop - first, prices.shape[1] + 1), np.nan), []
     for number, fold in enumerate(folds):
         tradable = _tradable(baseline, fold, prices, universe)
@@ -137,12 +137,14 @@ def _tradable(baseline: Baseline, fold: Fold, prices: Floats, universe: Bools | 
 
 
 def _calendar(
-    baseline: Baseline, folds: Sequence[Fold], rows: int, month: int, terms: Terms, changing: bool
+    baseline: Baseline,
+    folds: Sequence[Fold],
+    rows: int,
+    month: int,
+    terms: Terms,
+    universe: Bools | None,
 ) -> tuple[Bools, Bools]:
-    """At which rows a baseline is asked, and at which its last answer is an order, both (rows,).
-
-    changing: whether assets come and go.
-    """
+    """At which rows a baseline is asked, and at which its last answer is an order, both (rows,)."""
     if baseline.calendar not in get_args(Calendar):
         raise QfolioError(
             f"calendar of {type(baseline).__name__} is {baseline.calendar!r}; it must be one of "
@@ -155,8 +157,11 @@ def _calendar(
         gives = (np.arange(rows) - folds[0].decisions.start) % month == 0
     if baseline.calendar != "fold":
         return gives, gives
-    asks = gives & changing
+    asks = np.zeros(rows, bool)
     asks[[fold.decisions.start for fold in folds]] = True
+    if universe is not None:
+        where = np.flatnonzero(asks | gives)
+        asks[where[1:]] |= (universe[where[1:]] != universe[where[:-1]]).any(axis=1)
     return asks, gives
 
 

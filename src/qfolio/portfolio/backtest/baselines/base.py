@@ -52,10 +52,11 @@ class Baseline(ABC):
     A warning in ``decide`` becomes a note in the report, with the baseline and the fold.
 
     Attributes:
-        calendar: When ``decide`` is called. "fold": at the first decision of each fold; its result
-            is the target of every row of the fold, so that drift is traded back at every row.
-            "month": every ``History.month`` rows from the first decision of the test on; the
-            holding drifts in between. "row": at every row; None then lets the holding drift.
+        calendar: When ``decide`` is called. "fold": at the first decision of each fold, and where
+            the assets that may be bought have changed since; its result is the target of every row
+            from there on, so that drift is traded back at every row. "month": every
+            ``History.month`` rows from the first decision of the test on; the holding drifts in
+            between. "row": at every row; None then lets the holding drift.
         estimates: Whether ``decide`` reads past prices. If not, it may hold any asset that is
             available at the decision, where assets come and go.
         months: Latest months that it reads (default: the training window and all rows since).
