@@ -23,6 +23,7 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.desk.desk import Desk
+from qfolio.portfolio.desk.rule import Rule
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.feasible import exactly
 from qfolio.portfolio.mandate.limits import feasible, mandate_text
@@ -501,6 +502,37 @@ def test_what_a_delisting_paid_counts_as_cash_for_baselines() -> None:
     assert decisions[14, 1] > 0.3  # the last row with a price of A
     assert decisions[15, 0] == pytest.approx(decisions[14, 1] - 0.1, abs=0.02)
     assert decisions[16, 0] == pytest.approx(decisions[15, 0] - 0.1, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["minimum-variance", "volatility-timing"])
+def test_what_was_delisted_long_ago_does_not_shorten_the_training(name: str) -> None:
+    """It started late; what it paid out is no price of the years since."""
+    frame = frame_of(90, 4)
+    frame.iloc[:20, 3], frame.iloc[30:, 3] = np.nan, np.nan
+    folds = [Fold("one", slice(0, 60), slice(60, 88), slice(30, 60))]
+    found = []
+    for columns in (4, 3):
+        prices = load(frame.iloc[:, :columns], late="join", ended="cash-out")
+        task = Portfolio.of(prices, window=5, horizon=5)
+        entry, _ = Replay(prices, folds, task, 1.0).baseline("baseline", name, baseline(name))
+        rule = Rule(name, baseline(name), prices.assets, task, train="60d", expanding=True, cap=1.0)
+        found.append((entry.decisions[0, :, :4], list(rule.weights(prices).values())[:4]))
+    for ours, theirs in zip(*found, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+
+
+def test_an_asset_earns_what_cash_earns_until_its_first_price() -> None:
+    frame = frame_of(40, 3)
+    frame.iloc[:25, 0] = np.nan
+    prices = load(frame, late="join")
+    costs = {"cost_model": "itemized(cash_rate=0.05,carry_rate=0.02)"}
+    task = Portfolio.of(prices, window=5, horizon=5, **costs)
+    folds = [Fold("one", slice(0, 10), slice(10, 38), slice(0, 10))]
+    cash, late, *others = Replay(prices, folds, task, 1.0).growth.T
+    assert (cash > 1).all()
+    np.testing.assert_array_equal(late[:14], cash[:14])  # up to the return of row 25
+    assert (late[14:] != cash[14:]).all()
+    assert (others[0] != cash).all()
 
 
 def test_what_a_delisting_paid_earns_what_cash_earns() -> None:

@@ -103,7 +103,7 @@ class Replay:
 
     @cached_property
     def _complete(self) -> list[Fold]:
-        return [fold.complete(self.prices.values) for fold in self.folds]
+        return [fold.complete(self.prices.known) for fold in self.folds]
 
     @cached_property
     def _conditions(self) -> Conditions:
@@ -123,10 +123,16 @@ class Replay:
 
     @cached_property
     def growth(self) -> np.ndarray:
-        """Growth factors of cash and each asset over the test's returns, shape (day, entry)."""
+        """Growth factors of cash and each asset over the test's returns, shape (day, entry).
+
+        Where an asset has no price, its factor is that of cash.
+        """
         context = self._conditions.holding(self.rows, self.rows + 1)
         growth = np.asarray(self.task.costs.carry(self.relatives, context))
-        return np.asarray(delisted(growth, self.relatives, context.listed))
+        growth = np.array(delisted(growth, self.relatives, context.listed))
+        unpriced = np.isnan(self.prices.values[self.rows])
+        growth[:, 1:] = np.where(unpriced, growth[:, :1], growth[:, 1:])
+        return growth
 
     @cached_property
     def relaxed(self) -> list[tuple[Mandated, list[str]]]:

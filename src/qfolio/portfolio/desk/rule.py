@@ -82,7 +82,7 @@ class Rule(Untrained):
         """The baseline's target; without one, the holdings, which a margin call reduces."""
         table = self.table(prices)
         held = np.array([(holdings or {"cash": 1.0}).get(n, 0.0) for n in ("cash", *self.assets)])
-        fold = latest("latest", table.dates, self.train, self.expanding).complete(table.values)
+        fold = latest("latest", table.dates, self.train, self.expanding).complete(table.known)
         there = tradable = fold.tradable(table.values)
         if table.tradable is not None:
             priced = ~np.isnan(table.values[fold.train]).any(0)
