@@ -283,6 +283,31 @@ def test_an_order_of_a_delisted_asset_is_refused():
         create(prices, strategies={"mine": weights([100, 150], B=[0.5, 0.5])})
 
 
+def test_a_weight_may_be_below_zero_by_rounding():
+    mine = np.full((ROWS, 4), np.nan)
+    mine[100:, :] = [-2e-9, 0.25, 0.75 + 2e-9, 0.0]
+    backtest = create(strategies={"mine": mine})
+    entry = backtest.replay.own("strategy", backtest._own["mine"])
+    assert entry.simulation.weights.min() == 0
+
+
+@pytest.mark.parametrize(("every", "rows"), [(1, 1), (7, 7)])
+def test_a_table_does_not_grow_beyond_its_index(every, rows):
+    """Nor by a day; a level of a week lasts for one, and holidays before change nothing."""
+    last = ROWS - 20
+    level = pd.DataFrame({"date": DAYS, "level": table().values.mean(1)})
+    known = level.iloc[: last + 1 : every].drop(index=[49, 91]).reset_index(drop=True)
+    first = create(table().between(0, last + 1), benchmark=known)
+    for count in (last + 1, last + rows):
+        first.extended(table().between(0, count))
+    said = f"benchmark has no level after {DAYS[last]}; start a new .* up to {DAYS[last + rows]}"
+    with pytest.raises(QfolioError, match=said):
+        first.extended(table().between(0, last + rows + 1))
+    create(table().between(0, last + 1), benchmark=level.iloc[: last - 1])  # as on holidays
+    ahead = create(table().between(0, last + 1), benchmark=level)
+    assert len(ahead.extended(table()).dates) == ROWS - 100
+
+
 def test_a_return_on_a_day_between_rows_is_refused():
     prices = table(every=7)
     dates = [*prices.dates.astype("datetime64[D]").astype(str), "2022-03-31"]

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from qfolio.core.arrays import Floats
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.folds import spell
@@ -197,7 +197,7 @@ def compliance(
 
 def _require_long_only(name: str, own: Own) -> None:
     least = own.values.min(axis=1)
-    if (short := least < 0).any():
+    if (short := least < -TOLERANCE).any():
         row = int(short.argmax())
         raise QfolioError(
             f"{name} has a weight of {least[row]:.3g} on {day(own.dates[row])}, counting cash; the "
@@ -250,20 +250,41 @@ def _returns(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
 
 def _growth(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
     """Returns on the days of the test, from the last levels that were known at each row."""
-    rows = prices.dates[earned.start - 1 : earned.stop]
-    dates = own.dates
-    if (dates == dates.astype("datetime64[D]")).all():
-        rows = rows.astype("datetime64[D]")
-    latest = np.searchsorted(dates, rows, side="right") - 1
-    old = (latest < 0) | (rows - dates[np.maximum(latest, 0)] > OLDEST)
+    first = earned.start - 1
+    latest, old = _levels(own, prices.dates[first : earned.stop])
     if old.any():
         raise QfolioError(
-            f"{name} has no level on {_day(prices, earned.start - 1 + int(old.argmax()))} or in "
-            f"the week before; it needs levels from {_day(prices, earned.start - 1)} to "
+            f"{name} has no level on {_day(prices, first + int(old.argmax()))} or in the week "
+            f"before; it needs levels from {_day(prices, first)} to "
             f"{_day(prices, earned.stop - 1)}."
         )
     levels = own.values[latest]
     return np.asarray(levels[1:] / levels[:-1] - 1)
+
+
+def require_levels(name: str, own: Own, prices: Prices) -> None:
+    """Raises QfolioError if an index lacks the last rows of a table that has grown.
+
+    Its last level may count for as many rows as its levels usually do, such as one of a week for
+    five days; for more, it would stand still.
+    """
+    if own.kind != "levels":
+        return
+    latest, _ = _levels(own, prices.dates)
+    *before, last = np.bincount(latest[latest >= 0], minlength=len(own.dates))
+    if last > np.median([count for count in before if count] or [1]):
+        raise QfolioError(
+            f"{name} has no level after {day(own.dates[-1])}; start a new backtest with its levels "
+            f"up to {_day(prices, -1)}."
+        )
+
+
+def _levels(own: Own, rows: Dates) -> tuple[Rows, Bools]:
+    """The number of the last level that is known at each row, and whether it is none or too old."""
+    if (own.dates == own.dates.astype("datetime64[D]")).all():
+        rows = rows.astype("datetime64[D]")
+    latest = np.searchsorted(own.dates, rows, side="right") - 1
+    return latest, (latest < 0) | (rows - own.dates[np.maximum(latest, 0)] > OLDEST)
 
 
 def _day(prices: Prices, row: int | np.integer) -> str:

@@ -42,7 +42,7 @@ from qfolio.portfolio.backtest.folder import (
 from qfolio.portfolio.backtest.folds import fewest, require_tested, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow
-from qfolio.portfolio.backtest.own import Own, place
+from qfolio.portfolio.backtest.own import Own, place, require_levels
 from qfolio.portfolio.backtest.plan import Plan
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.statistics import assessment
@@ -270,13 +270,15 @@ class Backtest:
         trains new folds and new policies for tomorrow; earlier ones are kept.
 
         Raises:
-            QfolioError: The table does not begin with the backtest's rows; the error names the
-                first row and column that differ.
+            QfolioError: The table does not begin with the backtest's rows (the error names the
+                first row and column that differ), or a strategy of one's own lacks the new rows.
         """
         require_type("prices", prices, Prices, "a table that qfolio.load_prices has read")
         require_grown(self.prices, prices)
         if len(prices) == len(self.prices):
             return self
+        for name, own in self._given_own.items():
+            require_levels(name, own, prices)
         prices = dataclasses.replace(prices, source=self.prices.source, note=self.prices.note)
         trained = self._plan.grown(self._kept, len(prices))
         longer = Backtest(prices, self.config, None, self.agents, self._given_own, trained)
