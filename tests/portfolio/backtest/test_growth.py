@@ -115,6 +115,20 @@ def test_a_first_delisting_is_refused_where_assets_started_late():
         )
 
 
+def test_nothing_is_kept_before_a_longer_table_is_trained_on(first, tmp_path):
+    """A policy updated by hand would take the name of the one that is still to be trained."""
+    shutil.copytree(first.folder, tmp_path / "run")
+    why = tmp_path / "run" / "why.json"
+    why.write_text("{}")
+    longer = Backtest.open(tmp_path / "run").extended(table())
+    assert not why.exists()  # nor are old attributions mixed with a new test
+    updated = longer.policy(stored="latest")
+    updated.updates = 1
+    with pytest.raises(QfolioError, match="not finished; continue with qfolio backtest --resume"):
+        longer.keep(None, updated)
+    assert longer._kept.names("pathwise") == first._kept.names("pathwise")
+
+
 def test_the_same_table_trains_nothing(first):
     assert first.extended(table(FIRST)).jobs(Here()) == []
 

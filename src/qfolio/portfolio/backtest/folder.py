@@ -209,7 +209,8 @@ class BacktestFolder:
 
     def grow(self, prices: Prices, trained: Sequence[tuple[int, int]]) -> None:
         """Replaces the table by a longer one; the backtest is unfinished until it has run."""
-        (self.path / "summary.json").unlink(missing_ok=True)
+        for name in ("summary.json", "why.json"):
+            (self.path / name).unlink(missing_ok=True)
         self.write_prices(prices, trained)
 
     def read_config(self) -> BacktestConfig:

@@ -49,14 +49,18 @@ class Kept:
 
     def policy(self, agent: str, fold: str, template: Any) -> Any:
         """A policy, in the structure of the template; raises QfolioError if it is not trained."""
+        self.require(agent, fold)
+        if self.folder is None:
+            return self._policies[agent, fold]
+        return self.folder.read_policy(agent, fold, template)
+
+    def require(self, agent: str, fold: str) -> None:
+        """Raises QfolioError unless an agent is trained on a fold."""
         if not self.has(agent, fold):
             where = (
                 f"qfolio backtest --resume {shell(self.folder.path)}" if self.folder else "run()"
             )
             raise QfolioError(f"The backtest is not finished; continue with {where} first.")
-        if self.folder is None:
-            return self._policies[agent, fold]
-        return self.folder.read_policy(agent, fold, template)
 
     def records(self, agent: str, fold: str) -> Records:
         """Every training episode of all seeds, in order of time; empty if there are none."""

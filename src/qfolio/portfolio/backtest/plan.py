@@ -113,7 +113,7 @@ class Plan:
         agent = job.name.partition("/")[0]
         for fold, result in trained.items():
             policy = result.kept
-            if fold == self._latest:
+            if fold == self.current:
                 policy = learning(policy, self._trained[-1][0], self._prices.dates[-1])
             kept.write(agent, fold, result.rows, policy)
 
@@ -153,7 +153,7 @@ class Plan:
                 )
 
     @property
-    def _latest(self) -> str:
+    def current(self) -> str:
         """The policies for tomorrow that are trained on the whole table."""
         return tomorrow(self._trained[-1][0])
 
@@ -194,6 +194,6 @@ class Plan:
             tuple(self._parts[name, fold.name] for fold in folds),
             tuple(seed_range(self._config.seeds, self._config.seed)),
             Budget(self._config.agents[name].episodes),
-            self._latest,
+            self.current,
             most,
         )

@@ -398,7 +398,11 @@ class Backtest:
         )
 
     def keep(self, agent: str | None, policy: Policy) -> None:
-        """Stores an updated policy as the agent's policy for tomorrow; earlier ones are kept."""
+        """Stores an updated policy as the agent's policy for tomorrow; earlier ones are kept.
+
+        Raises QfolioError if that of the whole table is not trained yet, whose name it may have.
+        """
+        self._kept.require(self._name(agent), self._plan.current)
         kept = learning(policy.learner, policy.updates, policy.learned)
         self._kept.write_policy(self._name(agent), tomorrow(policy.updates), kept)
 
