@@ -2,7 +2,8 @@
 
 Each decision moves the last target by a step that depends on the latest prices. That target is not
 stored: prices have turned it into the holding, so the holding divided by the price relatives is
-proportional to it.
+proportional to it. Where a calendar has fewer decisions than rows, this gives the holding of the
+row before instead of the last target.
 """
 
 from abc import abstractmethod
@@ -18,8 +19,8 @@ from qfolio.portfolio.backtest.baselines.base import (
     with_cash,
 )
 
-FEWEST = 5
-"""Least number of rows that a step sees, however few a month has: those that OLMAR averages."""
+ROWS = 5
+"""Rows that a step sees: those that OLMAR averages."""
 
 
 class Online(Baseline):
@@ -32,13 +33,12 @@ class Online(Baseline):
         """Return the direction in which the target moves, of shape (assets,).
 
         Args:
-            target: The weights of the last order, of shape (assets,).
-            prices: The latest prices of shape (rows, assets): a month's, or ``FEWEST`` rows.
+            target: The weights of the last order, of shape (assets,); see above.
+            prices: The latest prices, of shape (``ROWS``, assets).
         """
 
     def decide(self, history: History, held: Floats) -> Floats:
-        prices = history.prices[-max(history.month + 1, FEWEST) :]
-        prices = prices[:, history.tradable]
+        prices = history.prices[-ROWS:, history.tradable]
         weights = held[1:][history.tradable]
         if not weights.any():
             return with_cash(equal_weights(history), history)
@@ -69,7 +69,7 @@ class Olmar(Online):
     """
 
     def step(self, target: Floats, prices: Floats) -> Floats:
-        predicted = prices[-FEWEST:].mean(axis=0) / prices[-1]
+        predicted = prices[-ROWS:].mean(axis=0) / prices[-1]
         return _reach(predicted, 10 - target @ predicted)
 
 
