@@ -40,6 +40,11 @@ def test_no_constant_weights_grow_more() -> None:
     assert bound < math.inf
 
 
+def test_a_bound_beyond_all_floats_is_infinite() -> None:
+    """A few minutes, each of which doubles the price."""
+    assert constant_bound(np.tile([1.0, 2.0], (9, 1)), 98_280) == math.inf
+
+
 def test_without_a_certificate_there_is_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     strict = partial(hindsight.growth_optimal, tol=-1.0)
     monkeypatch.setattr(hindsight, "growth_optimal", strict)

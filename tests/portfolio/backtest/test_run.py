@@ -19,10 +19,10 @@ from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio.backtest import notes
 from qfolio.portfolio.backtest.folder import MOST_WEIGHTS, BacktestFolder, rows_written
 from qfolio.portfolio.backtest.kept import LATEST
-from qfolio.portfolio.backtest.replay import Stretch, decide
+from qfolio.portfolio.backtest.replay import Entry, Stretch, decide
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.backtest.training import FoldsJob
 from qfolio.portfolio.following import begin, follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices, load
@@ -476,6 +476,18 @@ def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):
     assert list(Backtest.open(tmp_path / "run").agents) == ["pathwise:fast"]
 
 
+def test_the_note_on_ruin_counts_seeds():
+    def entry(*returns):
+        table = np.array(returns)[:, None] * np.ones((1, 3))
+        return Entry("agent", table, Simulation(table, table, table, table[..., None]))
+
+    found = notes.wiped_out({"a": entry(-1, 0.1, -1), "b": entry(-1), "c": entry(0.1, -0.9)})
+    assert found == [
+        "a was wiped out with 2 of 3 seeds: it lost everything.",
+        "b was wiped out: it lost everything.",
+    ]
+
+
 def test_a_wrong_baseline_of_ones_own_is_found_before_the_training(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -504,6 +516,7 @@ def test_a_wrong_baseline_of_ones_own_is_found_before_the_training(tmp_path, mon
         ({"lag": -1}, "lag is -1"), ({"agents": {}}, "at least one agent"),
         ({"cap": 1.5}, "The cap is 1.5; it must be above 0"), ({"cap": np.nan}, "The cap is nan"),
         ({"baselines": "momentum"}, "baselines is 'momentum'; it must be a list"),
+        ({"baselines": ("momentum", "m:momentum")}, "Two baselines are called momentum; rename"),
         ({"agents": changed("dqn", menu="nonsense")}, "menu is 'nonsense'; it must be like"),
         ({"agents": changed("pathwise", horizon=13)}, "^pathwise: rollout_length .* divide the 13"),
         ({"episodes": 3}, "are for agents without a preset; change those of a preset with"),

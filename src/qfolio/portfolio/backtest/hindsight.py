@@ -1,6 +1,6 @@
 """The growth that no constant weights could have exceeded: a bound, known only in hindsight."""
 
-import math
+import numpy as np
 
 from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
@@ -18,10 +18,11 @@ def constant_bound(growth: Floats, periods_per_year: float) -> float | None:
         periods_per_year: Rows in a year.
 
     Returns:
-        The growth as a simple annual rate; None if the solver did not reach its tolerance.
+        The growth as a simple annual rate, infinite beyond all floats; None if the solver did not reach its tolerance.
     """
     try:
         best = growth_optimal(growth)
     except QfolioError:
         return None
-    return math.expm1(periods_per_year * best.growth)
+    with np.errstate(over="ignore"):  # a short test of many rows a year may be too good
+        return float(np.expm1(periods_per_year * best.growth))

@@ -133,13 +133,12 @@ def called(replay: Replay, entries: Mapping[str, Entry], own: Container[str]) ->
 
 def wiped_out(entries: Mapping[str, Entry]) -> list[str]:
     """A note on each strategy that lost everything."""
-    counts = {name: int(entry.simulation.ruined.sum()) for name, entry in entries.items()}
-    return [
-        f"{name} was wiped out: its debts exceeded what it owned"
-        + (f", with {count} of {len(entries[name].decisions)} seeds." if count > 1 else ".")
-        for name, count in counts.items()
-        if count
-    ]
+    notes = []
+    for name, entry in entries.items():
+        lost = entry.simulation.ruined
+        seeds = "" if lost.all() else f" with {lost.sum()} of {lost.size} seeds"
+        notes += [f"{name} was wiped out{seeds}: it lost everything."] * bool(lost.any())
+    return notes
 
 
 @eqx.filter_jit

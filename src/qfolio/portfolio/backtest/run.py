@@ -201,6 +201,9 @@ class Backtest:
         prices = load(prices)
         terms = TradingTerms.of(mandate, cost, cost_model, calendar, benchmark)
         field = field_of(prices, agents, baselines, strategies or {}, terms.benchmark)
+        names = [short(name) for name in field.baselines]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise QfolioError(f"Two baselines are called {twice[0]}; rename one of them.")
         limits = terms.mandate
         if limits is not None:
             limits = tracked(limits, terms.benchmark, field, prices)
