@@ -143,8 +143,7 @@ def test_rows_that_move_the_folds_are_refused():
     dates = np.busday_offset(following.astype("M8[D]"), -1, roll="forward")
     months = changed(dates=dates).between(0, FIRST)
     dates[FIRST] = dates[FIRST - 1] + 2
-    options = {"train": "5y", "test": "1y", "seeds": 1, "baselines": ()}
-    run = Backtest.create(months, {"pathwise": AGENT}, **options)
+    run = Backtest.create(months, {"pathwise": AGENT}, train="5y", test="1y", seeds=1, baselines=())
     message = r"folds begin on other dates \(first: \d+-\d+-\d+, now .*\); start a new backtest"
     with pytest.raises(QfolioError, match=message):
         run.extended(changed(dates=dates).between(0, FIRST + 1))

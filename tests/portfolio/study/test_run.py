@@ -137,8 +137,8 @@ def test_a_table_whose_summary_is_lost_can_be_written_again(finished):
 def test_a_backtest_that_has_gone_on_beyond_its_table_is_not_pooled(finished, tmp_path):
     folder = tmp_path / "study"
     shutil.copytree(finished.folder, folder)
-    returns = Study.open(folder).backtest("one").folder / "returns.csv"
-    summary = returns.with_name("summary.json")
+    place = folder / "tables/one/lag1-10bp"
+    returns, summary = place / "returns.csv", place / "summary.json"
     content = json.loads(summary.read_text())
     day = str(TABLES["one"].dates[-1].astype("datetime64[D]") + 1)
     with returns.open("a") as file:

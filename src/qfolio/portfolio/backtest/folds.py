@@ -121,7 +121,7 @@ def require_fold(dates: np.ndarray, train: str, test: str, lag: int) -> None:
 
 
 def require_tested(dates: np.ndarray, train: str, least: int) -> None:
-    """Raises QfolioError unless a table has some number of rows or more after those for training."""
+    """Raises QfolioError if fewer than some number of rows follow those for training."""
     count = len(dates) - _after(dates, 0, train)
     if count < least:
         raise TooFewRowsError(

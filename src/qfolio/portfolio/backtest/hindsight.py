@@ -18,7 +18,8 @@ def constant_bound(growth: Floats, periods_per_year: float) -> float | None:
         periods_per_year: Rows in a year.
 
     Returns:
-        The growth as a simple annual rate, infinite beyond all floats; None if the solver did not reach its tolerance.
+        The growth as a simple annual rate, infinite if it is beyond all floats; None if the solver
+        did not reach its tolerance.
     """
     try:
         best = growth_optimal(growth)
