@@ -154,7 +154,7 @@ class Plan:
 
     @property
     def current(self) -> str:
-        """The policies for tomorrow that are trained on the whole table."""
+        """Name of the policies for tomorrow that are trained on the whole table."""
         return tomorrow(self._trained[-1][0])
 
     def _task(self, name: str) -> Portfolio:

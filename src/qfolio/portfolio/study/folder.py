@@ -153,8 +153,8 @@ class StudyFolder:
         if days and np.datetime64(days[-1]) > np.datetime64(last):
             raise QfolioError(
                 f"{files.path} has gone on to {days[-1]}, but the study's table {table} ends on "
-                f"{last}; start a study of the longer table in another folder (--after "
-                f"{shell(self.path)})."
+                f"{last}; start a study of the longer table in another folder, and count the looks "
+                "of this one (--trials)."
             )
         try:
             summary = read_json(files.path / "summary.json")
