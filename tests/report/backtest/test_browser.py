@@ -175,7 +175,7 @@ def test_the_command_does_not_fill_a_page_alone(tmp_path: Path) -> None:
     print_pdf(page, printed)
     text = subprocess.run([read, printed, "-"], capture_output=True, text=True, check=True).stdout
     last = text.rstrip("\f").split("\f")[-1]
-    for heading in ("About this test", "Not modeled", "Reproduce"):
+    for heading in ("Not modeled", "Reproduce"):  # the section before may begin on an earlier page
         assert heading in last
 
 
