@@ -264,6 +264,18 @@ def test_two_processes_cannot_train_in_one_folder(task, agent, tmp_path):
     Run.open(tmp_path / "run").train()
 
 
+def test_a_run_that_was_trained_further_elsewhere_is_not_cut_back(task, agent, tmp_path):
+    run, other = create(task, agent, tmp_path / "run"), Run.open(tmp_path / "run")
+    other.train()
+    before = contents(tmp_path / "run")
+    with pytest.raises(QfolioError, match="run was trained further elsewhere; open it again"):
+        run.train(Budget(2))
+    np.testing.assert_equal(contents(tmp_path / "run"), before)
+    other.train(Budget(14))
+    other.train(Budget(16))
+    assert Run.open(tmp_path / "run").episodes == 16
+
+
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut", "a row lost"])
 def test_a_learning_curve_that_was_damaged(task, agent, tmp_path, damage):
     """Whole points stay; where there is none, the curve begins again with where the run is."""

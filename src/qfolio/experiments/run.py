@@ -91,7 +91,7 @@ class Run(Seeds):
                 run._folder = RunFolder(unfinished)
                 run._folder.write_config(config)
                 run._write_checkpoint()
-            run._folder = RunFolder(place)
+            run._folder.path = place
         return run
 
     @classmethod
@@ -152,7 +152,8 @@ class Run(Seeds):
 
         A first Ctrl-C stops after the current chunk, sets ``interrupted`` and leaves a checkpoint;
         with an executor, it leaves the finished groups of seeds. Raises QfolioError if a loss is
-        not finite (the last good checkpoint stays) or if another process trains in the folder.
+        not finite (the last good checkpoint stays), if another process trains in the folder, or if
+        one has done so since this run was opened.
 
         Args:
             budget: The budget of each seed, including earlier training.
@@ -167,6 +168,8 @@ class Run(Seeds):
         require_listeners(listeners)
         executor = on(executor)
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
+            if self._folder is not None:
+                self._folder.require_latest()
             if isinstance(executor, Here) and not self.groups.begun:
                 self.train_here(budget, listeners, log)
             else:

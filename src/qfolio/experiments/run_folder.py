@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from qfolio.core.config import Config, read_config, write_config
+from qfolio.core.errors import QfolioError
 from qfolio.core.files import (
     naming,
     read_tree,
@@ -70,6 +71,7 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._written: int | None = None  # when the checkpoint was that was last read or written
 
     def write_config(self, config: RunConfig) -> None:
         write_config(self.path / CONFIG, config)
@@ -86,10 +88,23 @@ class RunFolder:
         require_there(self.path)
         write_tree(self.path / POLICY, weights)
         write_tree(self.path / CHECKPOINT, state)
+        self._written = self._last
 
     def read_checkpoint(self, template: Any) -> Any:
         """The state that ``write_checkpoint`` wrote, in the shape of ``template``."""
+        self._written = self._last  # first: a later one is then noticed
         return read_tree(self.path / CHECKPOINT, template)
+
+    def require_latest(self) -> None:
+        """Raises QfolioError if someone else has written a checkpoint since the last one here."""
+        if self._last not in (self._written, None):
+            raise QfolioError(f"{self.path} was trained further elsewhere; open it again.")
+
+    @property
+    def _last(self) -> int | None:
+        """When the checkpoint was written; None if there is none."""
+        path = self.path / CHECKPOINT
+        return path.stat().st_mtime_ns if path.exists() else None
 
     def append(self, name: str, rows: Records) -> None:
         """Appends rows to a table, with a header if it is new."""
