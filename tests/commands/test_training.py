@@ -13,9 +13,13 @@ import numpy as np
 import pytest
 
 from qfolio.commands.training import _train
+from qfolio.core.files import locked
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.executor import Here
+from qfolio.experiments.run import Run
 
+from jobs import Elsewhere
+from listeners import Interrupt
 from shell import TINY, qfolio
 
 
@@ -213,6 +217,39 @@ def test_resume_finishes_a_contrast_that_was_interrupted(run, monkeypatch, capsy
     assert (folder / "contrast" / "checkpoint.safetensors").exists()
     assert (folder / "report.html").exists()
     assert not (folder / "contrast" / "contrast").exists()
+
+
+def test_a_contrast_that_cannot_be_trained_costs_nothing_but_itself(
+    run, monkeypatch, capsys, tmp_path
+):
+    folder = shutil.copytree(run[0], tmp_path / "run")
+    steps = json.loads((folder / "summary.json").read_text())["env_steps"] + 40
+    with locked(folder / "contrast"):
+        assert qfolio(monkeypatch, "train", "--resume", folder, "--steps", steps) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"contrast is left out\. .*contrast is in use by process", printed)
+    assert f"Report: {folder}" in printed
+    assert json.loads((folder / "summary.json").read_text())["env_steps"] == steps
+    before = (folder / "report.html").read_bytes()
+    assert qfolio(monkeypatch, "report", folder) == 0
+    assert (folder / "report.html").read_bytes() == before
+
+
+def test_a_contrast_that_was_stopped_in_groups_goes_on_to_the_new_budget(
+    run, monkeypatch, capsys, tmp_path
+):
+    """It was refused the new budget until somebody finished the earlier one by hand."""
+    folder = shutil.copytree(run[0], tmp_path / "run")
+    contrast = Run.open(folder / "contrast")
+    steps = contrast.done("steps") + 40
+    contrast.train(
+        Budget(steps=steps), executor=Elsewhere(), listen=lambda job, done, share: [Interrupt()]
+    )
+    assert contrast.groups.begun  # the first seed is trained
+    assert qfolio(monkeypatch, "train", "--resume", folder, "--steps", steps + 40) == 0
+    assert "left out" not in capsys.readouterr().out
+    done = [Run.open(place).done("steps") for place in (folder, folder / "contrast")]
+    assert done == [steps + 40] * 2
 
 
 OWN = """

@@ -135,7 +135,12 @@ def train(
     if run.interrupted:
         stop(command)
     with resumable(command):
-        contrast = _contrast(run, folder, executor) if compare else None
+        contrast = None
+        if compare:
+            try:
+                contrast = _contrast(run, folder, executor)
+            except QfolioError as error:  # the grade and the report do not need it
+                console.say(f"The training for contrast is left out. {error}")
         if contrast is not None and contrast.interrupted:
             stop(command)
         return outcome(folder, _finish(run, folder, contrast))
@@ -299,7 +304,10 @@ def _contrast(run: "Run", folder: Path, executor: "Executor") -> "Run | None":
         )
     if run.budget.left(contrast.population):
         say(f"\nFor contrast, {variant.variant_name} ({contrast.config.seeds} of the seeds):")
-        _train(contrast, run.budget, executor)
+        if contrast.groups.begun:  # with the budget that the run had then
+            _train(contrast, contrast.budget, executor)
+        if not contrast.interrupted:
+            _train(contrast, run.budget, executor)
     return contrast
 
 
@@ -312,6 +320,8 @@ def write_again(folder: Path) -> None:
 
     run, place = Run.open(folder), folder / CONTRAST
     contrast = Run.open(place) if (place / "checkpoint.safetensors").exists() else None
+    if contrast is not None and run.budget.left(contrast.population):
+        contrast = None  # it was left out
     path = folder / "summary.json"
     summary = read_json(path) if path.is_file() else {}
     if summary.get("episodes") != run.episodes:
