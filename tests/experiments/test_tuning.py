@@ -716,7 +716,12 @@ def test_tune_from_the_command_line(tmp_path, monkeypatch, capsys):
     # Joining what is done only writes the report again.
     assert qfolio(monkeypatch, "tune", "--join", folder) == 0
     assert (folder / "summary.json").stat().st_mtime_ns == before
-    # What follows from the trials is made again if it is damaged.
+    # Of other trials, it is no report's: only the search makes it again, as if it were damaged.
+    other = json.dumps(summary | {"best": {"learning_rate": 1.0}})
+    (folder / "summary.json").write_text(other)
+    assert qfolio(monkeypatch, "report", folder) == 2
+    assert f"not finished; continue with qfolio tune --join {folder}." in capsys.readouterr().err
+    assert (folder / "summary.json").read_text() == other
     (folder / "summary.json").write_text('{"best": {')
     assert qfolio(monkeypatch, "tune", "--join", folder) == 0
     assert json.loads((folder / "summary.json").read_text()) == summary

@@ -83,7 +83,8 @@ def train(
             module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
         compare: For DQN, also train up to two seeds with one setting changed, for the report:
-            double DQN, or in markets learning from one action at a time instead of all at once.
+            double DQN, or in markets learning from one action at a time instead of all at once. If
+            that fails, the report does without.
         live: Show an episode of the pendulum in a window at each point of the learning curve.
     """
     prepare(trust)

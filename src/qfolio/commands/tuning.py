@@ -139,9 +139,8 @@ def write_again(folder: Path) -> None:
     tuning = _tuning()
     work = tuning.Tuning.open(folder)
     resume = again("qfolio tune --join", folder, work.task, work.agent)
-    if not (folder / "summary.json").is_file():
+    if (summary := work.summary) is None:
         raise QfolioError(f"The search is not finished; continue with {resume}.")
-    summary = work.conclude()
     write_tuning_report(folder, sweep(work, summary, f"{command(work, summary['best'])}\n{resume}"))
 
 

@@ -323,6 +323,12 @@ class Tuning:
         add_result(self.folder, self._results(found, preset_of(trials)))
         return summary
 
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """What ``conclude`` has found of the best configuration so far; None if it has not yet."""
+        best = best_of(self.journal.trials())
+        return None if best is None else self._summary(best)
+
     def _summary(self, best: Trial) -> dict[str, Any] | None:
         """The content of summary.json if it is about this configuration."""
         with contextlib.suppress(QfolioError):  # missing or damaged: it is made again
