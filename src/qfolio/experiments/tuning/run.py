@@ -386,7 +386,8 @@ class Tuning:
 
 
 def _name(asked: Asked) -> str:
-    return f"trial {asked.trial.number}"
+    """The name of a trial, counted from 1 as in the report."""
+    return f"trial {asked.trial.number + 1}"
 
 
 def _require_counts(**counts: int) -> None:
