@@ -473,6 +473,19 @@ def test_agents_that_do_not_fit_are_refused_before_anything_is_trained(tmp_path)
 
 
 @pytest.mark.parametrize(
+    ("names", "says"),
+    [(["Q fast", "q"], "An agent is called 'Q fast'; use letters"),
+     (["q-a", "q:a"], "q:a and q-a would share a folder")],
+)  # fmt: skip
+def test_names_that_no_folder_can_have_are_refused(names, says, tmp_path):
+    """Such a comparison was created and could not be opened."""
+    entrants = dict(zip(names, tiny().values(), strict=True))
+    with pytest.raises(QfolioError, match=says):
+        Comparison.create(entrants, seeds=3, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
     ("damage", "message"),
     [({"format": 0}, "another format"), ({"kind": "backtest"}, "is a backtest, not a comparison"),
      ({"results": {"slow": {}}}, "damaged"), ({"results": {"who": None}}, "damaged"),

@@ -1,6 +1,7 @@
 """Typed configuration of a folder: written as JSON and validated when read."""
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, ClassVar, TypeVar
 
@@ -8,6 +9,7 @@ import msgspec
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json, write_json
+from qfolio.core.text import quote
 from qfolio.core.version import __version__
 
 AGENT_NAME = r"^[\w-]+(:[\w-]+)?$"
@@ -19,6 +21,18 @@ AgentName = Annotated[str, msgspec.Meta(pattern=AGENT_NAME)]
 def agent_folder(name: str) -> str:
     """The name of an agent's folder; some systems allow no colon there."""
     return name.replace(":", "-")
+
+
+def require_agent_names(names: Collection[str]) -> None:
+    """Raises QfolioError unless each can be an agent's name, and that of a folder of its own."""
+    for name in names:
+        if not (isinstance(name, str) and re.fullmatch(AGENT_NAME, name)):
+            raise QfolioError(
+                f"An agent is called {quote(name)}; use letters, digits, - and _, and at most one "
+                "colon within, as in tilts:low-risk."
+            )
+        if (folder := agent_folder(name)) != name and folder in names:
+            raise QfolioError(f"{name} and {folder} would share a folder; rename one.")
 
 
 class Config(msgspec.Struct, kw_only=True, frozen=True):

@@ -19,7 +19,14 @@ import msgspec
 import numpy as np
 
 from qfolio.core import devices, settings
-from qfolio.core.config import AgentName, Config, agent_folder, read_config, write_config
+from qfolio.core.config import (
+    AgentName,
+    Config,
+    agent_folder,
+    read_config,
+    require_agent_names,
+    write_config,
+)
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, path_of, read_json
@@ -113,6 +120,7 @@ class ComparisonConfig(Config, frozen=True):
 
     def __post_init__(self) -> None:
         seed_range(self.seeds, self.seed)
+        require_agent_names(self.agents)
         if not self.results.keys() <= self.agents.keys():
             raise QfolioError("there are results of unknown agents.")
 
@@ -146,7 +154,8 @@ class Comparison:
     ) -> "Comparison":
         """Creates a comparison in which no agent has been trained yet.
 
-        Raises QfolioError if an agent does not fit the task or into memory.
+        Raises QfolioError if an agent does not fit the task or into memory, or its name cannot be
+        that of a folder.
 
         Args:
             entrants: Two or more agents, by name.

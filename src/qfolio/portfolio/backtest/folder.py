@@ -10,7 +10,6 @@ summary.json, why.json (what explains the agents) and the report. ledger/ has th
 
 import csv
 import math
-import re
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -20,11 +19,11 @@ import numpy as np
 
 from qfolio.core import settings
 from qfolio.core.config import (
-    AGENT_NAME,
     AgentName,
     Config,
     agent_folder,
     read_config,
+    require_agent_names,
     write_config,
 )
 from qfolio.core.errors import QfolioError
@@ -41,7 +40,7 @@ from qfolio.core.files import (
 )
 from qfolio.core.mdp import Agent
 from qfolio.core.registry import BASELINES, name_of
-from qfolio.core.text import quote, shell
+from qfolio.core.text import shell
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.presets import Preset
 from qfolio.experiments.records import Records
@@ -108,13 +107,8 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
 
         rows: the fewest that a fold trains on.
 
-        Raises QfolioError if the name cannot be that of a folder, or there are no episodes.
+        Raises QfolioError if there are no episodes.
         """
-        if not (isinstance(name, str) and re.fullmatch(AGENT_NAME, name)):
-            raise QfolioError(
-                f"An agent is called {quote(name)}; use letters, digits, - and _, and at most one "
-                "colon within, as in tilts:low-risk."
-            )
         if isinstance(agent, Preset):
             chosen = fitted(agent, rows, lag)
             horizons = [each.task.get("horizon", 0) for each in (agent, chosen)]
@@ -170,6 +164,7 @@ class BacktestConfig(Config, frozen=True):
 
     def __post_init__(self) -> None:
         seed_range(self.seeds, self.seed)
+        require_agent_names(self.agents)
         if not {"source", "rows", "first", "last", "digest"} <= self.prices.keys():
             raise QfolioError("the description of prices is incomplete.")
         for name, entry in self.agents.items():
@@ -182,10 +177,6 @@ class BacktestConfig(Config, frozen=True):
                 raise QfolioError(
                     f"{name}{TOGETHER} is what all seeds of {name} hold together; give that agent "
                     "another name."
-                )
-            if agent_folder(name) in self.agents.keys() - {name}:
-                raise QfolioError(
-                    f"{name} and {agent_folder(name)} would share a folder; rename one."
                 )
 
 
