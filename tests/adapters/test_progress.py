@@ -50,6 +50,19 @@ def test_a_notebook_shows_how_far_it_is(shown, monkeypatch):
     assert "2 of 2 jobs" in shown[-1]
 
 
+def test_the_time_left_of_a_resumed_training_follows_from_what_was_done_since(shown, monkeypatch):
+    monkeypatch.setattr("qfolio.adapters.progress.EVERY", 0.0)
+    now = [1.0]
+    monkeypatch.setattr("qfolio.adapters.progress.perf_counter", lambda: now[0])
+    with qfolio.tracked(qfolio.Progress()), Log(None).opened(kind="run") as log:
+        log.write("running", job="", share=0.6)
+        assert "60%" in shown[-1]
+        assert "left" not in shown[-1]
+        now[0] = 11.0
+        log.job().record(5, {"return": [1.0]}, share=0.7)
+        assert "0:00:30 left" in shown[-1]
+
+
 def test_hostile_names_stay_text(shown):
     train("<img src=x onerror=alert(1)>")
     assert "&lt;img" in shown[-1]

@@ -91,6 +91,8 @@ def test_the_log_says_at_which_step_each_way_ends(tmp_path):
     last = {e["job"]: e["step"] for e in events if e["event"] == "record"}
     assert {e["job"]: e["step"] for e in events if e["event"] == "done"} == last
     assert last["frozen"] == last["first training"] > 0
+    # What was learned before the change is no part of going on.
+    assert {e["share"] for e in events if e["event"] == "running"} == {0.0}
 
 
 def test_every_way_begins_with_what_it_knows(content):

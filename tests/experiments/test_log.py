@@ -90,9 +90,16 @@ def test_a_stopped_run_says_so_and_where_it_goes_on(task, agent, tmp_path):
     *_, job, end = logged(tmp_path / "run")
     assert (job["event"], end["event"], end["state"]) == ("stopped", "end", "stopped")
     Run.open(tmp_path / "run").train(Budget(400))
-    begun = [event["step"] for event in logged(tmp_path / "run", "running")]
-    assert begun == [0, job["step"]]
+    begun = logged(tmp_path / "run", "running")
+    assert [event["step"] for event in begun] == [0, job["step"]]
     assert logged(tmp_path / "run")[-1]["state"] == "done"
+    # The share is that of the whole training, not of what was left of it.
+    events = [event for event in logged(tmp_path / "run") if event.get("share") is not None]
+    shares = [event["share"] for event in events]
+    assert shares == [
+        pytest.approx(event["step"] / events[-1]["step"], abs=1e-4) for event in events
+    ]
+    assert 0 < begun[1]["share"] < 1
 
 
 def test_an_error_ends_the_log(tmp_path, agent):

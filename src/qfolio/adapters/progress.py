@@ -32,6 +32,7 @@ class Progress(Tracker):
         agents = ", ".join(map(str, about.get("agents", [])))
         self._name = " on ".join(filter(None, (agents, str(about.get("task", "")))))
         self._jobs: dict[str, float] = {}  # finished share of each
+        self._before: dict[str, float] = {}  # the same, when it was resumed
         self._text, self._begun, self._shown = "", perf_counter(), 0.0
         self._show, self._close = _in_notebook() or _on_terminal()
 
@@ -39,8 +40,10 @@ class Progress(Tracker):
         kind, job = event["event"], event.get("job", "")
         if kind == "queued":
             self._jobs |= {name: 0.0 for name in event["jobs"] if name not in self._jobs}
-        elif kind in ("running", "done"):
-            self._jobs[job] = float(kind == "done")
+        elif kind == "running":
+            self._jobs[job] = self._before[job] = event.get("share", 0.0)
+        elif kind == "done":
+            self._jobs[job] = 1.0
         elif kind == "record":
             self._jobs[job] = event.get("share", self._jobs.get(job, 0.0))
             rate = f"{event['rate']:,.0f} steps/s" if event.get("rate") else ""
@@ -62,7 +65,8 @@ class Progress(Tracker):
     @property
     def _said(self) -> str:
         spent, done = perf_counter() - self._begun, self._done
-        left = datetime.timedelta(seconds=round(spent * (1 / done - 1))) if done else None
+        here = done - sum(self._before.values()) / max(len(self._jobs), 1)
+        left = datetime.timedelta(seconds=round(spent * (1 - done) / here)) if here > 0 else None
         jobs = f"{sum(x == 1 for x in self._jobs.values())} of {len(self._jobs)} jobs"
         parts = [self._name, f"{done:.0%}", jobs if len(self._jobs) > 1 else "", self._text]
         parts.append("" if left is None else f"{left} left" if done < 1 else f"{spent:.1f} s")

@@ -272,7 +272,7 @@ def _compare(
     ) -> tuple[Course | None, bool]:
         worlds = grades if name == FIRST else grades[::-1]
         listeners = [] if listen is None else [listen(name)]
-        job = log.job(name, seed_names(seeds))
+        job = log.job(name, seed_names(seeds), population.steps * population.agent.num_envs)
         return _learn(population, episodes, points, worlds, job, listeners)
 
     grades = Grades(plan.task), Grades(plan.changed)

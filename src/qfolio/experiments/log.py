@@ -123,9 +123,12 @@ class Log:
         if jobs:
             self.write("queued", jobs=list(jobs))
 
-    def job(self, name: str = "", members: Sequence[str] = ()) -> "JobLog":
-        """The listener that logs a job's training; members: their names, such as seeds."""
-        return JobLog(self, name, members)
+    def job(self, name: str = "", members: Sequence[str] = (), since: int = 0) -> "JobLog":
+        """The listener that logs a job's training.
+
+        members: their names, such as seeds. since: a member's steps before the job first began.
+        """
+        return JobLog(self, name, members, since)
 
     def track(self, job: str, step: int, values: Mapping[str, Sequence[float | None]]) -> None:
         """Passes the means over members to the trackers."""
@@ -168,8 +171,8 @@ class Log:
 class JobLog(Listener):
     """Logs the training of a job."""
 
-    def __init__(self, log: Log, name: str, members: Sequence[str]) -> None:
-        self.log, self.name, self.members = log, name, list(members)
+    def __init__(self, log: Log, name: str, members: Sequence[str], since: int) -> None:
+        self.log, self.name, self.members, self.since = log, name, list(members), since
         self._rows: list[Records] = []  # of each chunk
         self._of: list[int] = []  # the member of each row
         self._ends: list[int] = []  # the step at which the episode of each row ended
@@ -177,14 +180,14 @@ class JobLog(Listener):
         self._step, self._share = 0, 0.0  # of the previous record
 
     def on_start(self, training: Training) -> None:
-        self._step, self._share = training.steps, training.share
+        self._step, self._share = training.steps, self._share_of(training)
         self.log.write(
             "running",
             job=self.name,
             step=training.steps,
             worker=training.where,
             members=self.members,
-            share=training.share,
+            share=round(self._share, 4),
         )
 
     def on_chunk(self, training: Training, rows: Records) -> None:
@@ -207,9 +210,14 @@ class JobLog(Listener):
         self.log.write("record", job=self.name, step=step, **more, values=values)
         self.log.track(self.name, step, values)
 
+    def _share_of(self, training: Training) -> float:
+        """The share of the job that is done, what was done before it was resumed included."""
+        done = training.steps - self.since
+        return done / max(done + training.left * training.num_envs, 1)
+
     def _flush(self, training: Training) -> None:
         rows, members, ends = Records.joined(self._rows), self._of, self._ends
-        step, share = training.steps, training.share
+        step, share = training.steps, self._share_of(training)
         parts = math.ceil(PARTS * (share - self._share))
         for some in _parts(np.array(ends, int), parts, max(1, len(self.members))):
             at = step if some.stop == len(rows) else ends[some.stop - 1]
