@@ -2,6 +2,7 @@
 
 import datetime
 import re
+import secrets
 import shlex
 import sys
 from collections.abc import Sequence
@@ -56,9 +57,13 @@ def budget_of(episodes: int | None, steps: int | None) -> Budget | None:
 
 
 def new_folder(*words: str) -> Path:
-    """A folder in runs/ that is named by the words, such as task and agent, and the time."""
+    """A folder in runs/ that is named by the words, such as task and agent, and the time.
+
+    Four random digits tell it from that of a command that starts in the same second.
+    """
     name = "-".join([re.sub("[/:]", "-", word) for word in words])
-    return Path("runs") / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    return Path("runs") / f"{name}-{now}-{secrets.token_hex(2)}"
 
 
 def prepare(trust: Sequence[str]) -> None:
@@ -72,6 +77,12 @@ def prepare(trust: Sequence[str]) -> None:
 def typed() -> str:
     """The command line as it was typed."""
     return shlex.join(["qfolio", *sys.argv[1:]])
+
+
+def typed_options() -> set[str]:
+    """The options that were typed, by the names of their parameters."""
+    names = (word.partition("=")[0] for word in sys.argv[1:] if word.startswith("--"))
+    return {name[2:].replace("-", "_") for name in names}
 
 
 def again(command: str, folder: Path, *parts: object, on: str = "here") -> str:
