@@ -138,6 +138,8 @@ def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
     assert (tmp_path / "run" / "returns.csv").read_text() == before
     for more, message in (
         (["--resume", "run", "--benchmark", "A"], "--resume keeps the backtest's settings"),
+        (["--resume", "run", "--cost-bps=10"], "--resume keeps the backtest's settings"),
+        (["--resume", "run", "--title", ""], "--resume keeps the backtest's settings"),
         ([*options[:-len(own) - len(tiny)], "--strategy", "mine"], "it must be NAME=FILE"),
         ([*options[:-len(own) - len(tiny)], "--benchmark", "Z"], "and no file"),
     ):  # fmt: skip

@@ -50,8 +50,9 @@ def test_resuming_a_finished_study_reports_again(place, monkeypatch, capsys):
     assert "This study took 2 looks." in printed
     assert json.loads((place / "run/study.json").read_text()) == before
     assert (place / "run/report.html").exists()
-    assert qfolio(monkeypatch, "study", "--resume", place / "run", "--lags", "3") == 2
-    assert "--resume keeps the study's settings" in capsys.readouterr().err
+    for words in (["--lags", "3"], ["--seed=0"], ["--cost-bps", 10]):  # defaults, too
+        assert qfolio(monkeypatch, "study", "--resume", place / "run", *words) == 2
+        assert "--resume keeps the study's settings" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from qfolio.commands.arguments import (
     new_folder,
     sources,
     typed,
+    typed_options,
 )
 from qfolio.commands.tables import READING, Reading
 from qfolio.core import registry, settings
@@ -111,13 +112,12 @@ class Options(Reading):
     trust: Modules = ()
 
     def only_resumes(self, table: bool = False) -> bool:
-        """Whether nothing but ``resume``, ``on``, ``track`` and ``trust`` is given.
+        """Whether no options but ``--resume``, ``--on``, ``--track`` and ``--trust`` were typed.
 
-        table: Whether the options for reading a table may be given, too.
+        table: Whether those for reading a table may be typed, too.
         """
-        read = READING.reading if table else {}
-        rest = dataclasses.replace(self, resume=None, on=DEFAULTS.on, track=(), trust=(), **read)
-        return rest == DEFAULTS
+        own = {"resume", "on", "track", "trust", "json"}
+        return typed_options() <= (own | READING.reading.keys() if table else own)
 
     def folder(self, kind: str) -> Path:
         """The path of the new folder: ``out``, or runs/KIND-TIME."""

@@ -81,7 +81,7 @@ def backtest(
             out=folder,
             **options.settings(),
         )
-    elif title is None and options.only_resumes(table=file is not None):
+    elif options.only_resumes(table=file is not None):
         run, folder = Backtest.open(options.resume), options.resume
         if file is not None:
             run = run.extended(options.like(run.prices).load(file))

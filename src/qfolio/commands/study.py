@@ -72,7 +72,7 @@ def study(
             out=options.folder("study"),
             **options.settings(),
         )
-    elif options.only_resumes() and not (sets or lags or costs_bps or after):
+    elif options.only_resumes() and not sets:
         run = Study.open(options.resume)
     else:
         raise QfolioError(
