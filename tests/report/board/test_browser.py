@@ -155,6 +155,29 @@ def test_a_run_that_is_deleted_leaves_the_page(
     assert browser.evaluate("document.getElementById('counts').innerText") == "No runs yet"
 
 
+def test_jobs_that_work_was_divided_into_before_leave_the_page(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    log = tmp_path / "runs" / "mine" / EVENTS
+    log.parent.mkdir()
+
+    def write(*events: dict[str, object]) -> None:
+        with log.open("a") as file:
+            file.writelines(json.dumps({"time": time.time(), **event}) + "\n" for event in events)
+
+    def trained(job: str) -> dict[str, object]:
+        return {"event": "record", "job": job, "step": 9, "values": {"return": [1.0]}}
+
+    begin = {"event": "start", "kind": "comparison", "agents": ["dqn"], "pid": 1, "host": "h"}
+    write(begin, trained("dqn/0"), trained("dqn/1"))
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 2")
+    write(begin, trained("dqn"), {"event": "done", "job": "dqn"})
+    browser.wait("document.querySelectorAll('#charts .line').length === 3")
+    write({"event": "end", "state": "done", "pid": 1, "host": "h"})
+    browser.wait("document.querySelectorAll('#charts .line').length === 1")
+    assert "dqn/0" not in browser.evaluate("document.body.innerText")
+
+
 def test_a_metric_may_be_named_like_what_each_object_has(
     board: Board, browser: Browser, tmp_path: Path
 ) -> None:

@@ -294,13 +294,13 @@ class Experiment:
         }  # fmt: skip
 
     def detail(self, since: int) -> dict[str, Any]:
-        """All results, and the jobs that have changed after a version of the board."""
+        """All results, the names of all jobs, and those that have changed after a version."""
         curves = sum(len(job.curves) for job in self.jobs.values())
         most = min(POINTS, max(2, SHOWN // max(curves, 1)))
         changed = {name: job for name, job in self.jobs.items() if job.version > since}
         return {
-            "begun": self.begun,
             "results": self.results,
+            "names": list(self.jobs),
             "jobs": [job.to_json(name, most) for name, job in changed.items()],
         }
 

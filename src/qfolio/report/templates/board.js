@@ -486,16 +486,16 @@ async function look() {
 }
 
 async function refresh(key) {
-  const known = details.get(key) || { version: 0, begun: null, jobs: new Map(), results: {} };
+  const known = details.get(key) || { version: 0, jobs: new Map(), results: {} };
   const news = await ask(`/runs/${key}?since=${known.version}`);
   if (!news || !chosen.includes(key)) return false;
   details.set(key, known);
   known.version = news.version;
-  if (known.begun !== news.begun) known.jobs.clear(); // another run in the same folder
-  known.begun = news.begun;
+  const names = new Set(news.names), gone = [...known.jobs.keys()].filter((name) => !names.has(name));
+  for (const name of gone) known.jobs.delete(name); // of work that was divided otherwise, or of another run
   known.results = news.results;
   for (const job of news.jobs) known.jobs.set(job.name, job);
-  return news.jobs.length > 0;
+  return news.jobs.length + gone.length > 0;
 }
 
 async function forever() {
