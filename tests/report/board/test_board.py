@@ -77,6 +77,15 @@ def test_a_search_runs_as_long_as_one_of_its_processes_does(tmp_path):
     assert read_again(tmp_path).state == "stopped"
 
 
+def test_a_search_that_was_killed_was_paused_until_it_goes_on(tmp_path):
+    write(tmp_path, start(kind="search", time=0.0), {**RUNNING, "time": 100.0})
+    write(tmp_path, start(kind="search", pid=2, time=130.0))  # joins it
+    assert read_again(tmp_path).paused == 0
+    write(tmp_path, start(kind="search", pid=3, time=86_530.0), {**END, "pid": 3, "time": 86_540.0})
+    experiment = read_again(tmp_path)
+    assert (experiment.paused, experiment.state) == (86_400.0, "done")
+
+
 def test_a_resumed_job_counts_nothing_twice(tmp_path):
     write(tmp_path, start(), RUNNING, *(record(step, step) for step in (10, 20, 30)))
     write(tmp_path, start(), {**RUNNING, "step": 20}, *(record(step, -step) for step in (30, 40)))

@@ -30,6 +30,10 @@ REPORT = "report.html"
 SHARED = "search"
 """The kind of experiment that several processes may work on at once."""
 
+DEAD = 600.0
+"""Seconds without an event after which the processes of such an experiment were killed, although
+the log has no end; longer than a chunk or a compilation takes."""
+
 Point = tuple[float, float, float, float]
 """A step, and the mean, lowest and highest value there."""
 
@@ -233,14 +237,16 @@ class Experiment:
             return
         self.version = version
         if isinstance(said, Start):
+            pause = max(said.time - self.last, 0.0)
+            if said.kind != SHARED or pause > DEAD:
+                self._working.clear()
             if self.begun is None:
                 self.begun = said.time
-            elif said.kind != SHARED or not self._working:
-                self.paused += max(said.time - self.last, 0.0)
+            elif not self._working:
+                self.paused += pause
             self.about, self.last = said, said.time
             if said.kind != SHARED:
                 self.end = None
-                self._working.clear()
             self._working.add((said.pid, said.host))
         elif isinstance(said, End):
             self.end, self.last = said, said.time
