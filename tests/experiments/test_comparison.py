@@ -1,5 +1,6 @@
 import contextlib
 import dataclasses
+import html
 import json
 import math
 import re
@@ -283,6 +284,7 @@ def test_a_comparison_shows_itself_in_a_notebook(finished):
     assert repr(run) == f"<Comparison: slow, quick on pendulum, {run.config.seeds} seeds, {wanted}"
     shown = run._repr_html_()
     assert "2 of 2 agents" in shown
+    assert html.escape(content["conclusion"][0]) in shown
     for name in ("slow", "quick"):
         assert f"<td>{name}</td>" in shown
         middle = float(interquartile_mean(content["results"][name]["returns"]))
@@ -400,6 +402,10 @@ def test_an_agent_that_diverges_does_not_stop_the_others(tmp_path):
     assert list(content["failures"]) == ["wild"]
     assert re.match(r"wild could not be trained. The loss of seed", content["notes"][0])
     assert Comparison.open(tmp_path / "run").finish() == content  # as qfolio report does
+    run.failures = {}  # they are tried again, and the ranking waits for them
+    run._write()
+    kept = Comparison.open(tmp_path / "run").config
+    assert (kept.ranking, kept.conclusion, kept.notes) == (None, [], [])
     alone = Comparison.create(tiny(wild=1e29, wilder=1e30), seeds=3, out=tmp_path / "alone")
     alone.run()
     with pytest.raises(QfolioError, match=r"fewer than two agents to compare\. wild: The loss"):

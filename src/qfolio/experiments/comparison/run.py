@@ -399,15 +399,16 @@ class Comparison:
 
     def _write(self) -> None:
         results = {name: self.results[name] for name in self.entrants if name in self.results}
-        content: dict[str, Any] = {"results": results, "failures": self.failures}
-        if len(results) > 1 and self.finished:
-            ranking = rank(results)
-            content |= {
-                "ranking": ranking,
-                "conclusion": conclusion(ranking),
-                "notes": self.notes(),
-            }
-        write_config(self.folder / FILE, msgspec.structs.replace(self.config, **content))
+        ranking = rank(results) if len(results) > 1 and self.finished else None
+        self.config = msgspec.structs.replace(
+            self.config,
+            results=results,
+            failures=dict(self.failures),
+            ranking=ranking,
+            conclusion=conclusion(ranking) if ranking else [],
+            notes=self.notes() if ranking else [],
+        )
+        write_config(self.folder / FILE, self.config)
 
 
 def _require_fit(name: str, entrant: Entrant, seeds: int) -> None:
