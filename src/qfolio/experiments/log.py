@@ -49,7 +49,10 @@ class Tracker:
         """
 
     def event(self, event: Mapping[str, Any]) -> None:
-        """Called with every event after the start, as logged; records also go to ``log``."""
+        """Called with every event after the start, as logged; records also go to ``log``.
+
+        What is graded after the training, as a run's ``result``, is only in the log and the report.
+        """
 
     def finish(self) -> None:
         """Called when the work has ended, for whatever reason."""
@@ -274,7 +277,10 @@ def seed_names(seeds: Iterable[int]) -> list[str]:
 
 
 def add_result(folder: Path | None, values: Mapping[str, Mapping[str, float | None]]) -> None:
-    """Appends the measures of trained agents, by name, to a folder's log if it has one."""
+    """Appends the measures of trained agents, by name, to a folder's log if it has one.
+
+    Trackers have finished by then.
+    """
     if folder is not None and (folder / EVENTS).exists():
         log = Log(folder)
         log._file = _open(folder / EVENTS)
