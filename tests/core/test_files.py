@@ -152,6 +152,22 @@ def test_a_folder_for_results_is_new_or_empty(tmp_path, monkeypatch):
         pass
 
 
+def test_a_folder_that_cannot_be_replaced_is_refused_before_any_work(tmp_path, monkeypatch):
+    empty, link, mounted = tmp_path / "empty", tmp_path / "link", tmp_path / "mounted"
+    empty.mkdir()
+    mounted.mkdir()
+    link.symlink_to(empty)
+    monkeypatch.setattr(os.path, "ismount", lambda path: path == mounted)
+    for folder in (link, mounted):
+        with pytest.raises(QfolioError, match=f"{folder.name} is a link or a mount point"):
+            new_folder(folder).__enter__()
+    empty.rmdir()  # the link leads nowhere now
+    with pytest.raises(QfolioError, match="link is a link or a mount point"):
+        new_folder(link).__enter__()
+    with new_folder(mounted / "run"):
+        pass
+
+
 def test_a_full_disk_is_named_where_only_the_folder_is_known(tmp_path):
     with pytest.raises(OSError, match="No space left") as error, new_folder(tmp_path / "run"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

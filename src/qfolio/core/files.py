@@ -80,7 +80,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def require_new(folder: Path, option: str | None = "--resume") -> None:
-    """Raises QfolioError unless ``folder`` is new, or empty and not the current one.
+    """Raises QfolioError unless ``folder`` is new, or empty and can be replaced.
 
     option: continues the work in it, if it is work.
     """
@@ -91,6 +91,10 @@ def require_new(folder: Path, option: str | None = "--resume") -> None:
         raise QfolioError(f"{folder} is not empty; name a new folder{more}.")
     if folder.resolve() == Path.cwd():  # which no other folder can replace
         raise QfolioError("The results cannot lie in the current folder itself; name a new one.")
+    if folder.is_symlink() or os.path.ismount(folder):
+        raise QfolioError(
+            f"{folder} is a link or a mount point, which no folder can replace; name a new folder."
+        )
 
 
 def require_there(folder: Path) -> None:
