@@ -181,6 +181,11 @@ def test_bash_completes_commands_and_options(monkeypatch, tmp_path):
         assert completed in found.stdout.split()
 
 
+def test_a_line_break_in_a_name_is_shown_and_not_obeyed(capsys):
+    console.say("", "Report: runs/a\nqfolio: all is well/report.html")
+    assert capsys.readouterr().out == "\nReport: runs/a\\nqfolio: all is well/report.html\n"
+
+
 def test_a_pipe_folds_nothing(capsys):
     row = ("a strategy with a long name", *["-123,456.78%"] * 12)
     console.print_table(("strategy", *["numbers"] * 12), [row])

@@ -78,7 +78,7 @@ def study(
         raise QfolioError(
             "--resume keeps the study's settings; add only --on, --track and --trust."
         )
-    console.say(describe_study(run))
+    console.say(*describe_study(run))
     parts = run.backtest(next(iter(run.config.tables))).parts
     resume = again("qfolio study --resume", run.folder, *parts, on=options.on)
     with resumable(resume), console.bar("") as update, tracked(*following):

@@ -123,7 +123,7 @@ def train(
             if live:
                 _require_seen(run.config.task)
         budget = budget or run.budget
-        console.say(describe_run(run, budget))
+        console.say(*describe_run(run, budget))
         if not budget.left(run.population):
             trained = amount(run.done(budget.unit), budget.unit.removesuffix("s"))
             console.say(
@@ -304,7 +304,7 @@ def _contrast(run: "Run", folder: Path, executor: "Executor") -> "Run | None":
             out=place,
         )
     if run.budget.left(contrast.population):
-        say(f"\nFor contrast, {variant.variant_name} ({contrast.config.seeds} of the seeds):")
+        say("", f"For contrast, {variant.variant_name} ({contrast.config.seeds} of the seeds):")
         if contrast.groups.begun:  # with the budget that the run had then
             _train(contrast, contrast.budget, executor)
         if not contrast.interrupted:

@@ -108,7 +108,7 @@ def tune(
     else:
         work = tuning.Tuning.open(join, trials=trials, batch=batch)
     resume = again("qfolio tune --join", work.folder, work.task, work.agent, on=on)
-    console.say(describe_search(work))
+    console.say(*describe_search(work))
     print_batch()
     with (
         resumable(resume),
@@ -219,7 +219,7 @@ def _conclude(work: "Tuning", resume: str, executor: "Executor") -> Document:
         data = sweep(work, summary, f"{train}\n{resume}")
         write_tuning_report(work.folder, data)
     print_search(summary, data.verdicts)
-    say(f"\nThis trains the best configuration of the search:\n{train}")
+    say("", "This trains the best configuration of the search:", train)
     say(f"Report: {work.folder / PAGE}")
     return summary
 

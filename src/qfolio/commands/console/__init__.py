@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from functools import partial
-from textwrap import fill
+from textwrap import wrap
 from typing import Literal
 
 import rich.progress
@@ -18,16 +18,17 @@ if not console.is_terminal:
     console.width = 10_000  # files and pipes have no width: nothing is folded there
 
 
-def say(text: str) -> None:
-    """Prints lines; control characters are escaped."""
-    print("\n".join(map(printable, text.split("\n"))), flush=True)
+def say(*lines: str) -> None:
+    """Prints lines; control characters are escaped, such as a line break in the name of a file."""
+    print("\n".join(map(printable, lines)), flush=True)
 
 
 def tell(sentences: str) -> None:
     """Prints sentences; a terminal breaks them between words."""
+    lines = [sentences]
     if console.is_terminal:
-        sentences = fill(sentences, console.width, break_long_words=False, break_on_hyphens=False)
-    say(sentences)
+        lines = wrap(sentences, console.width, break_long_words=False, break_on_hyphens=False)
+    say(*lines)
 
 
 @contextlib.contextmanager

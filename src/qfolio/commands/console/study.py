@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from qfolio.portfolio.study.run import Study
 
 
-def describe_study(study: "Study") -> str:
-    """Tables, variants and agents of a study, and why tables are left out."""
+def describe_study(study: "Study") -> list[str]:
+    """Lines with tables, variants and agents of a study, and why tables are left out."""
     config = study.config
     variants = amount(len(config.variants), "variant")
     tables = amount(len(config.tables), "table")
     left_out = (f"{name} is left out: {why}" for name, why in config.left_out.items())
     about = f"{tables} · {variants} · {' and '.join(config.agents)} · {config.device}"
-    return "\n".join([about, *left_out])
+    return [about, *left_out]
 
 
 def spell(variant: "Variant") -> str:

@@ -13,20 +13,21 @@ if TYPE_CHECKING:
     from qfolio.experiments.run import Run
 
 
-def describe_run(run: "Run", budget: "Budget") -> str:
-    """Agent, task and seeds of a run, and its budget if rounding makes it larger."""
+def describe_run(run: "Run", budget: "Budget") -> list[str]:
+    """Lines with agent, task and seeds of a run, and its budget if rounding makes it larger."""
     config, planned = run.config, budget.planned(run.population)
     seeds = amount(config.seeds, "seed")
-    return (
+    lines = [
         f"{short(config.agent).upper()} on {config.task} · preset {config.preset or 'none'} · "
         f"{seeds} · {config.device}"
-    ) + (
-        f"\n{budget.amount:,} steps become {planned:,}: {short(config.agent)} takes "
-        f"{amount(run.agent.rollout_steps, 'step')} in each of "
-        f"{amount(run.agent.num_envs, 'environment')} at once."
-        if budget.steps and planned > budget.amount and budget.left(run.population)
-        else ""
-    )
+    ]
+    if budget.steps and planned > budget.amount and budget.left(run.population):
+        lines.append(
+            f"{budget.amount:,} steps become {planned:,}: {short(config.agent)} takes "
+            f"{amount(run.agent.rollout_steps, 'step')} in each of "
+            f"{amount(run.agent.num_envs, 'environment')} at once."
+        )
+    return lines
 
 
 def print_result(seeds: list[int], result: dict[str, Any]) -> None:

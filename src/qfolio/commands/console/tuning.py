@@ -12,16 +12,15 @@ if TYPE_CHECKING:
     from qfolio.experiments.tuning.run import Tuning
 
 
-def describe_search(work: "Tuning") -> str:
-    """What a search trains, in a line, and each searched setting with its range and scale."""
+def describe_search(work: "Tuning") -> list[str]:
+    """A line with what a search trains, and one with the range and scale of each setting."""
     config, budget = work.config, work.config.budget
     seeds = amount(config.seeds, "seed")
-    space = "\n".join(f"  {dim.name:<20} {dim}  ({dim.scale})" for dim in work.space)
-    return (
+    return [
         f"{short(config.agent).upper()} on {config.task} · preset {config.preset} · "
-        f"{config.trials} trials × {seeds} · {budget.amount:,} {budget.unit} · "
-        f"{config.device}\n{space}"
-    )
+        f"{config.trials} trials × {seeds} · {budget.amount:,} {budget.unit} · {config.device}",
+        *(f"  {dim.name:<20} {dim}  ({dim.scale})" for dim in work.space),
+    ]
 
 
 def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
