@@ -55,6 +55,8 @@ WRONG_TYPES = {
     "Portfolio.of('prices.csv')": "prices is 'prices.csv'; it must be a table that",
     "finish('runs/mine')": "backtest is 'runs/mine'; it must be a backtest, such as",
     "policy.weights(prices, 'my.csv')": "holdings is 'my.csv'; it must be a dictionary",
+    "policy.weights(prices, spent=None)": "spent is None; it must be a number of at least 0.",
+    "load_prices('prices.csv', delisting_haircut='a')": "delisting_haircut is 'a'; it must be a n",
     "train('pendulum', DQN(), episodes=1)": "task is 'pendulum'; it must be a task, such as",
     "train(Pendulum(), 'dqn', episodes=1)": "agent is 'dqn'; it must be an agent, such as",
     "train(Pendulum(), DQN, episodes=1)": "agent is <class 'qfoli",

@@ -169,6 +169,17 @@ def test_a_network_says_what_it_cannot_read(kind, task, message):
         DQN(network=kind, hidden=(16,)).init(task, KEY)
 
 
+class Blind(TwoStates):
+    def observe(self, state):
+        return jnp.zeros(0)
+
+
+@pytest.mark.parametrize("kind", ["flat", "rnn"])
+def test_a_network_needs_something_to_read(kind):
+    with pytest.raises(QfolioError, match="Observations of Blind hold no number, but a network"):
+        DQN(network=kind, hidden=(16,)).init(Blind(), KEY)
+
+
 class Recall(TwoStates):
     """One step; the action must match the first row of three: Q(s, a) = s · (2a − 1)."""
 

@@ -290,8 +290,12 @@ def build(
 
     An encoder has ``hidden[0]`` outputs, and the remaining layers follow it. The gain has no
     effect on a network that assets share. observation: an example. Raises QfolioError if the kind
-    of network does not fit the observation.
+    of network does not fit the observation, or there is nothing to observe.
     """
+    if not any(map(jnp.size, jax.tree.leaves(observation))):
+        raise QfolioError(
+            f"Observations of {task.name} hold no number, but a network needs one or more."
+        )
     kind, hidden, input_gain, activation, initialization = config
     # Small weights on a bounded observation make a function too smooth for some tasks.
     gain = jnp.where(input_gain > 0, input_gain / jnp.array(task.observation_scale), 1.0)

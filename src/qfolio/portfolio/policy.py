@@ -141,6 +141,7 @@ class Policy:
             QfolioError: The assets are not those of the policy, or prices are missing in its
                 window.
         """
+        require_type("spent", spent, Real, "a number of at least 0")
         if not 0 <= spent < float("inf"):
             raise QfolioError(f"spent is {spent!r}; it must be a number of at least 0.")
         table = self.table(prices, **options)

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.text import near, quote
 from qfolio.portfolio.prices.columns import find_columns
 from qfolio.portfolio.prices.duplicates import check_duplicates
@@ -48,6 +49,7 @@ class Choices:
                 advice = near(str(value), filter(None, choices))
                 raise QfolioError(f"{name} is {quote(value)}; {advice}")
         haircut = self.delisting_haircut
+        require_type("delisting_haircut", haircut, Real, "a number")
         if not 0 <= haircut <= 1:
             raise QfolioError(f"delisting_haircut is {haircut}; it must be from 0 to 1.")
         if haircut and self.ended != "cash-out":
