@@ -150,5 +150,7 @@ def test_what_is_not_finished_names_the_command_that_goes_on(
     folder = tmp_path / "my run"
     begin(folder)
     assert qfolio(monkeypatch, "report", folder) == 2
-    said = capsys.readouterr().err.strip().removesuffix(".").partition("; continue with ")[2]
+    printed = capsys.readouterr()
+    assert "Writing" not in printed.out
+    said = printed.err.strip().removesuffix(".").partition("; continue with ")[2]
     assert shlex.split(said) == ["qfolio", *command, str(folder), "--trust", __name__]

@@ -46,7 +46,8 @@ def test_what_is_written_is_read(tmp_path):
         ({"far": 2}, r"\(far equals seeds\)"),
         ({"kind": "backtest"}, "is a backtest, not a sample"),
         ({"kind": 7}, "in another format"),
-        ({"format": 2, "version": "0.1"}, "was written by qfolio 0.1 in another format"),
+        ({"format": 2, "version": "0.1"}, "was written by qfolio 0.1 in another format, an older"),
+        ({"format": 4}, "another format, a newer one; this is .*: update qfolio, or start over"),
     ],
 )
 def test_what_does_not_fit_is_named(change, says, tmp_path):

@@ -35,7 +35,7 @@ def report(folder: Positional[Path], *, pdf: bool = False, trust: Modules = ()) 
     if pdf and find_browser() is None:
         print_pdf(folder / PAGE, folder / PDF)  # raises before anything is written
     prepare(trust)
-    with console.working("Writing the report"):
+    with console.working(f"Reading {folder}"):  # which may turn out to be unfinished
         WRITERS[kind](folder)
     console.say(f"Report: {folder / PAGE}")
     if pdf:

@@ -76,10 +76,15 @@ def read_config(path: Path, kind: type[C]) -> C:
     found = content.pop("kind", None)
     if isinstance(found, str) and found != kind.kind:
         raise QfolioError(f"{path.parent} is a {found}, not a {kind.kind}; give the folder of one.")
-    if found != kind.kind or content.pop("format", None) != kind.format:
+    form = content.pop("format", None)
+    if found != kind.kind or form != kind.format:
+        known = found == kind.kind and isinstance(form, int)
+        newer = known and form > kind.format
+        age = "" if not known else ", a newer one" if newer else ", an older one"
+        advice = "update qfolio" if newer else "use that version"
         raise QfolioError(
             f"{path.parent} was written by qfolio {content.get('version', '(unknown version)')} in "
-            f"another format; this is {__version__}: use that version, or start over."
+            f"another format{age}; this is {__version__}: {advice}, or start over."
         )
     try:
         return msgspec.convert(content, kind)
