@@ -5,16 +5,20 @@ import re
 import secrets
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import UseAppendAction, arg
 
-from qfolio.core import registry
+from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import own_modules
 from qfolio.experiments.budget import Budget
+
+if TYPE_CHECKING:
+    from qfolio.experiments.run_folder import RunConfig
+    from qfolio.experiments.tuning.run import SearchConfig
 
 Name = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
 Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
@@ -83,6 +87,19 @@ def typed_options() -> set[str]:
     """The options that were typed, by the names of their parameters."""
     names = (word.partition("=")[0] for word in sys.argv[1:] if word.startswith("--"))
     return {name[2:].replace("-", "_") for name in names}
+
+
+def training_command(
+    config: "RunConfig | SearchConfig", preset: str, changed: Mapping[str, Any], *more: str
+) -> str:
+    """The command line that trains the agent of a run or a search.
+
+    preset: its preset. changed: the settings that differ from it. more: further options.
+    """
+    words = ["qfolio", "train", config.task, "--agent", config.agent, "--preset", preset]
+    words += [f"--{config.budget.unit}", str(config.budget.amount), *more]
+    words += ["--set"] if changed else []
+    return shlex.join([*words, *(f"{k}={settings.written(v)}" for k, v in changed.items())])
 
 
 def again(command: str, folder: Path, *parts: object, on: str = "here") -> str:

@@ -1,7 +1,6 @@
 """The commands that train agents on a task, grade them and show them."""
 
 import contextlib
-import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +18,7 @@ from qfolio.commands.arguments import (
     budget_of,
     new_folder,
     prepare,
+    training_command,
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
@@ -373,16 +373,10 @@ def _command(run: "Run", contrast: "Run | None") -> str:
     if found is None:
         return resume
     preset, differing = found
-    changed = [
-        f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}"
-        for name, (value, _) in differing.items()
-    ]
-    words = ["qfolio train", config.task, "--agent", config.agent, "--preset"]
-    words += [preset, f"--{run.budget.unit}", str(run.budget.amount)]
-    words += ["--seeds", str(config.seeds), "--seed", str(config.seed)]
-    words += [] if compare else ["--no-compare"]
-    words += ["--set", *map(shlex.quote, changed)] if changed else []
-    return f"{' '.join(words)}\n{resume}"
+    changed = {name: value for name, (value, _) in differing.items()}
+    more = ["--seeds", str(config.seeds), "--seed", str(config.seed)]
+    more += [] if compare else ["--no-compare"]
+    return f"{training_command(config, preset, changed, *more)}\n{resume}"
 
 
 def _require_seen(task: str) -> None:

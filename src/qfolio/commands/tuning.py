@@ -1,6 +1,5 @@
 """The command that searches hyperparameters and reports which ones matter."""
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +16,7 @@ from qfolio.commands.arguments import (
     budget_of,
     new_folder,
     prepare,
+    training_command,
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
@@ -227,14 +227,10 @@ def _conclude(work: "Tuning", resume: str, executor: "Executor") -> Document:
 def command(work: "Tuning", values: dict[str, Any]) -> str:
     """The command line that trains a configuration."""
     from qfolio.experiments.presets import preset
-    from qfolio.experiments.tuning.search import written
 
     config = work.config
     base = preset(config.preset, config.task, config.agent)
     default = base.described(type(work.task))
     chosen = settings.describe(work.configured(values)) | config.task_settings
     changed = {name: value for name, value in chosen.items() if value != default.get(name)}
-    words = ["qfolio train", config.task, "--agent", config.agent, "--preset"]
-    words += [config.preset, f"--{config.budget.unit}", str(config.budget.amount)]
-    words += ["--set", *map(shlex.quote, written(changed))] if changed else []
-    return " ".join(words)
+    return training_command(config, config.preset, changed)

@@ -66,6 +66,15 @@ def _types(kind: type) -> dict[str, Any]:
     return {f.name: hints[f.name] for f in dataclasses.fields(kind) if hints[f.name] in kinds}
 
 
+def written(value: Any) -> str:
+    """A setting's value in the format of ``--set``."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return ",".join(map(str, value))
+    return str(value)
+
+
 def build(kind: type[T], settings: Mapping[str, Any]) -> T:
     """An agent or task with these fields set; the rest keep their defaults.
 

@@ -5,10 +5,9 @@ chunks: files, learning curves, progress, checkpoints.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,6 @@ class Training:
 
     Attributes:
         budget: The budget of each member.
-        config: The configuration, for listeners that record it.
         begun: Steps of each environment before this training.
         left: Remaining steps of each environment.
         done: Steps of each environment in this training so far.
@@ -41,7 +39,6 @@ class Training:
 
     _population: Population | None  # None in a report from a worker
     budget: Budget
-    config: Mapping[str, Any] = field(default_factory=dict)
     begun: int = 0
     left: int = 0
     done: int = 0
@@ -144,7 +141,6 @@ def fit(
     budget: Budget,
     listeners: Sequence[Listener] = (),
     *,
-    config: Mapping[str, Any] | None = None,
     chunk: int = 2**31,
     strict: bool = True,
 ) -> Training:
@@ -156,7 +152,6 @@ def fit(
         population: The population to train, from its current state.
         budget: The budget of each member, including earlier training.
         listeners: Called after every chunk, in their order.
-        config: The configuration, for listeners that record it.
         chunk: Maximum number of steps of a chunk, if below the population's own.
         strict: Whether a loss that is not finite raises QfolioError; otherwise the other members
             continue.
@@ -165,7 +160,6 @@ def fit(
     training = Training(
         population,
         budget,
-        config or {},
         begun=population.steps,
         left=budget.left(population),
         num_envs=population.agent.num_envs,

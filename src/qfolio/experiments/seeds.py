@@ -105,8 +105,7 @@ class Seeds:
             self._log = log
             stack.callback(setattr, self, "_log", None)
             hooks = [log, _Metrics(self), _Curve(self), *listeners, _Checkpoints(self)]
-            config = msgspec.to_builtins(self.config)
-            training = fit(self.population, budget, hooks, config=config)
+            training = fit(self.population, budget, hooks)
             self.interrupted = training.interrupted
             log.log.settle(training.finished)
 

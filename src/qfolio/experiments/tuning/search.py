@@ -173,7 +173,7 @@ def dimension(name: str, text: str, kind: type["Agent"]) -> Dimension:
     if name not in numbers(kind):
         raise QfolioError(
             f"{name} shapes the program, so each value is compiled separately; list the values: "
-            f"{name}={_written(ends[0])}|{_written(ends[1])}."
+            f"{name}={settings.written(ends[0])}|{settings.written(ends[1])}."
         )
     bottom, top = ends
     if not (bottom < top and math.isfinite(bottom) and math.isfinite(top)):
@@ -227,12 +227,7 @@ def require_buildable(
 def own_value(agent: "Agent", dim: Dimension) -> Value:
     """An agent's value of a searched setting."""
     value = getattr(agent, dim.name)
-    return _written(value) if dim.choices else float(value)
-
-
-def written(settings: Mapping[str, Any]) -> list[str]:
-    """Settings as ``name=value``, in the format of ``--set``."""
-    return [f"{name}={_written(value)}" for name, value in settings.items()]
+    return settings.written(value) if dim.choices else float(value)
 
 
 def positions(space: Sequence[Dimension], values: Mapping[str, Value]) -> np.ndarray:
@@ -255,13 +250,4 @@ def _missing(share: float) -> float:
 
 
 def _canonical(kind: type["Agent"], name: str, choice: str) -> str:
-    return _written(settings.convert(kind, {name: choice})[name])
-
-
-def _written(value: Any) -> str:
-    """A setting in the format of ``--set``."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list | tuple):
-        return ",".join(map(str, value))
-    return str(value)
+    return settings.written(settings.convert(kind, {name: choice})[name])

@@ -61,7 +61,7 @@ class FoldsJob:
         """The trained folds by name; None if Ctrl-C stopped it."""
         population = Population(*self._population)
         records = _RowsByFold(self)
-        training = fit(population, self.budget, [records, *listeners], config={"job": self.name})
+        training = fit(population, self.budget, [records, *listeners])
         if training.interrupted and not training.finished:
             return None
         return {
