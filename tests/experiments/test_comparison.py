@@ -21,7 +21,7 @@ from qfolio.core.statistics import interquartile_mean
 from qfolio.core.text import figure
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
-from qfolio.experiments.comparison.conclusion import amount, conclusion, share
+from qfolio.experiments.comparison.conclusion import conclusion, four_digits, share
 from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.operations import operations_per_step
 from qfolio.experiments.comparison.ranking import (
@@ -201,8 +201,8 @@ def test_agents_that_are_as_quick_are_named_together():
 @pytest.mark.parametrize(
     ("value", "text"), [(999.96, "1,000"), (999.94, "999.9"), (1234.4, "1,234"), (0.5, "0.5")]
 )
-def test_amounts(value, text):
-    assert amount(value) == text
+def test_returns_have_four_digits(value, text):
+    assert four_digits(value) == text
 
 
 def test_a_critic_is_no_part_of_the_policy():

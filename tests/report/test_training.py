@@ -51,8 +51,8 @@ from qfolio.report.figures.curves import (
 from qfolio.report.figures.pendulum import draw_value
 from qfolio.report.figures.policies import draw_policy
 from qfolio.report.training import (
-    amount,
     duration,
+    large,
     number,
     percent,
     render_page,
@@ -382,8 +382,8 @@ def test_numbers() -> None:
     assert number(-0.01) == "0.0"
     assert number(0.5, 2, sign=True) == "+0.50"
     assert percent(0.0314) == "3.1%"
-    assert amount(15_348.2) == "15,348"
-    assert amount(12_345_678) == "12.35 million"
+    assert large(15_348.2) == "15,348"
+    assert large(12_345_678) == "12.35 million"
     assert duration(6.44) == f"6.4{space}s"
     assert duration(119.6) == f"2{space}min"
     assert duration(3725) == f"1{space}h 2{space}min"

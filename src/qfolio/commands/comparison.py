@@ -202,7 +202,7 @@ def _print_ranking(content: dict[str, Any]) -> None:
     from qfolio.experiments.comparison.ranking import HEADLINE
 
     ranking = content["ranking"]
-    write = conclusion.share if ranking["measure"] == "regret" else conclusion.amount
+    write = conclusion.share if ranking["measure"] == "regret" else conclusion.four_digits
     near = f"steps to {HEADLINE:.0%}"
     spread = "95% interval" if ranking["seeds"] >= FEWEST_SEEDS else "range of seeds"
     heads = ("agent", ranking["measure"], spread, "worst", near, "s a seed", "parameters")

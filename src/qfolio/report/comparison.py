@@ -18,9 +18,9 @@ from qfolio.core.files import write_text
 from qfolio.core.statistics import FEWEST_SEEDS, band, interquartile_mean
 from qfolio.core.text import plural
 from qfolio.experiments.comparison.conclusion import (
-    amount,
     arrived,
     best_of,
+    four_digits,
     least,
     share,
     span,
@@ -86,7 +86,7 @@ class ComparisonData:
 
     def write(self, value: float) -> str:
         """A regret or a return as text."""
-        return tidy(share(value) if self.graded else amount(value))
+        return tidy(share(value) if self.graded else four_digits(value))
 
 
 def comparison_data(content: dict[str, Any]) -> ComparisonData:
@@ -138,7 +138,7 @@ def render_comparison(data: ComparisonData) -> str:
         better=_better(data),
         curves=svgs(draw_curves, data, LEAD),
         finals=svgs(draw_finals, data, WIDE),
-        common=rendering.amount(ranking["common_steps"]),
+        common=rendering.large(ranking["common_steps"]),
         floor=percent_tick(_floor(data)) if _logarithmic(data) else None,
         runs=[(name, *_settings(data, name)) for name in data.results],
     )
@@ -300,7 +300,11 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
     ]
     if data.graded and optimum is not None:
         facts.append(
-            ("Exact optimum", tidy(amount(optimum)), f"on {number(data.starts, 0)} fixed starts")
+            (
+                "Exact optimum",
+                tidy(four_digits(optimum)),
+                f"on {number(data.starts, 0)} fixed starts",
+            )
         )
     final = data.write(ranking["agents"][first]["final"]["iqm"])
 
@@ -312,7 +316,7 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
     if arrivals := arrived(ranking):
         (steps, frugal), (seconds, quick) = (least(arrivals, key) for key in ("steps", "seconds"))
         facts += [
-            (f"Fewest steps to {near}", rendering.amount(steps), who(frugal)),
+            (f"Fewest steps to {near}", rendering.large(steps), who(frugal)),
             (f"Least time to {near}", tidy(span(seconds)), f"{who(quick)}, a seed"),
         ]
     total = sum(result.seconds_train for result in results.values())
@@ -343,7 +347,7 @@ def _reached(data: ComparisonData, name: str) -> list[tuple[str, str]]:
         (data.write(final["iqm"]), spread()),
         (data.write(final["mean"]), ""),
         (data.write(final["worst"]), ""),
-        ("not reached" if near["steps"] is None else rendering.amount(near["steps"]),
+        ("not reached" if near["steps"] is None else rendering.large(near["steps"]),
          f"{near['reached']} of {seeds} seeds"),
         ("–" if near["seconds"] is None else tidy(span(near["seconds"])), ""),
         (data.write(agent["area"]["iqm"]), interval(agent["area"]["interval"])),
@@ -354,9 +358,9 @@ def _took(result: Result) -> list[str]:
     """An agent's costs."""
     operations = result.operations_per_step
     return [
-        rendering.amount(result.env_steps),
+        rendering.large(result.env_steps),
         tidy(span(result.seconds_per_seed)),
-        rendering.amount(result.steps_per_second),
+        rendering.large(result.steps_per_second),
         "–" if operations is None else _scaled(operations, ("", "k", "M", "G")),
         _scaled(result.state_bytes, ("B", "kB", "MB", "GB")),
         _scaled(result.policy_bytes, ("B", "kB", "MB", "GB")),
@@ -377,7 +381,7 @@ def _within(data: ComparisonData, name: str) -> list[tuple[str, str]]:
     """For each threshold, the steps until an agent stays within it, and how many seeds do."""
     seeds = len(data.results[name].returns)
     return [
-        ("–" if entry["steps"] is None else rendering.amount(entry["steps"]),
+        ("–" if entry["steps"] is None else rendering.large(entry["steps"]),
          "" if entry["reached"] == seeds else f"{entry['reached']} of {seeds}")
         for entry in data.ranking["agents"][name]["within"]
     ]  # fmt: skip
@@ -409,6 +413,6 @@ def _settings(data: ComparisonData, name: str) -> tuple[str, list[Any]]:
     """A line on an agent's training, and all its settings by group."""
     entry, result = data.content["agents"][name], data.results[name]
     preset = f"preset {entry['preset']}, " if entry["preset"] else ""
-    line = f"{entry['agent']}, {preset}at least {rendering.amount(result.episodes)} episodes a seed"
+    line = f"{entry['agent']}, {preset}at least {rendering.large(result.episodes)} episodes a seed"
     groups = {"agent": entry["agent_settings"], "task": entry["task_settings"]}
     return line, setting_groups(groups)

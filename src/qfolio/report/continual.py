@@ -24,7 +24,7 @@ from qfolio.report.figures.style import (
     svgs,
 )
 from qfolio.report.looks import Look
-from qfolio.report.rendering import amount, duration, number, percent, render, setting_groups
+from qfolio.report.rendering import duration, large, number, percent, render, setting_groups
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,7 +90,7 @@ def verdict(content: Content) -> str:
         elif steps is None:
             found.append(f"{name} does not settle {goal} in {_learned(content, way)} steps.")
         else:
-            found.append(f"{name} stays {goal} from {amount(round(steps))} steps on.")
+            found.append(f"{name} stays {goal} from {large(round(steps))} steps on.")
     return " ".join(found)
 
 
@@ -102,7 +102,7 @@ def _facts(content: Content) -> list[tuple[str, str, str]]:
         ("Optimum after", number(optimum["new"]), "exact"),
         ("Regret before", percent(float(interquartile_mean(training["final"]))), "after training"),
         ("Regret at once", percent(_middle(content, "frozen")), "after the change"),
-        ("First training", amount(training["steps"][-1]), "steps of a seed"),
+        ("First training", large(training["steps"][-1]), "steps of a seed"),
         ("Seeds", str(content["seeds"]), f"from {content['seed']} on"),
     ]
 
@@ -115,7 +115,7 @@ def _row(content: Content, way: str) -> list[tuple[str, str]]:
     seconds = course["seconds"]
     return [
         (percent(_middle(content, way)), f"worst {percent(max(course['final']))}"),
-        ("–" if middle is None else amount(round(middle)), f"{reached} of {content['seeds']}"),
+        ("–" if middle is None else large(round(middle)), f"{reached} of {content['seeds']}"),
         (_learned(content, way), duration(seconds) if seconds else ""),
         (percent(float(interquartile_mean(course["other"]))), ""),
     ]
@@ -123,7 +123,7 @@ def _row(content: Content, way: str) -> list[tuple[str, str]]:
 
 def _learned(content: Content, way: str) -> str:
     """Environment steps of a seed after the change."""
-    return amount(content["courses"][way]["steps"][-1])
+    return large(content["courses"][way]["steps"][-1])
 
 
 def _middle(content: Content, way: str) -> float:

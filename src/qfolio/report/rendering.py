@@ -79,7 +79,7 @@ def bands(seeds: int) -> str:
     return "95% bootstrap intervals over seeds"
 
 
-def amount(count: float) -> str:
+def large(count: float) -> str:
     """Return a large whole number with at least three significant digits."""
     if count >= 1e6:
         return f"{number(count / 1e6, 2)} million"

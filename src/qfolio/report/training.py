@@ -16,10 +16,10 @@ from qfolio.report.data import MarketData, ReportData, decimals
 from qfolio.report.figures import curves, pendulum, policies
 from qfolio.report.figures.style import LEAD, WIDE, save_png, svgs
 from qfolio.report.rendering import (
-    amount,
     changed_settings,
     counted,
     duration,
+    large,
     number,
     over_seeds,
     percent,
@@ -138,11 +138,11 @@ def _facts(
     digits = _digits(summary)
     together = "all seeds together" if seeds > 1 else "while training"
     counts = summary.get("episodes_per_seed", [summary["episodes"]])
-    done = " to ".join(amount(x) for x in sorted({min(counts), max(counts)})) + " episodes"
+    done = " to ".join(large(x) for x in sorted({min(counts), max(counts)})) + " episodes"
     if seeds > 1:
-        each = amount(summary["env_steps"]) + " steps" if unit == "steps" else done
+        each = large(summary["env_steps"]) + " steps" if unit == "steps" else done
         done = f"all seeds, {each} each"
-    speed = ("Steps per second", amount(summary["steps_per_second"]), together)
+    speed = ("Steps per second", large(summary["steps_per_second"]), together)
     facts = [("Return", number(summary["return_mean"], digits), _over_seeds(summary))]
     if summary["optimum"] is not None:
         facts.append(("Exact optimum", number(summary["optimum"], digits), "on the same starts"))
@@ -158,7 +158,7 @@ def _facts(
         speed,
         (
             "Environment steps",
-            amount(seeds * summary["env_steps"]),
+            large(seeds * summary["env_steps"]),
             done,
         ),
     ]

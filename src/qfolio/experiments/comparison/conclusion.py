@@ -76,7 +76,7 @@ def result_of(ranking: dict[str, Any], name: str, *, interval: bool = False) -> 
 
     ``interval`` adds its 95% interval, or the range of the seeds if they are too few for one.
     """
-    write = share if ranking["measure"] == "regret" else amount
+    write = share if ranking["measure"] == "regret" else four_digits
     final = ranking["agents"][name]["final"]
     text, values = write(final["iqm"]), final["per_seed"]
     if interval and final["interval"] is not None:
@@ -95,7 +95,7 @@ def share(fraction: float) -> str:
     return f"{figure(100 * fraction, f',.{digits}f')}%"
 
 
-def amount(value: float) -> str:
+def four_digits(value: float) -> str:
     """A number with four significant digits."""
     if abs(float(f"{value:.4g}")) >= 1000:
         return figure(value, ",.0f")
