@@ -126,6 +126,11 @@ def test_settings_out_of_range_are_named(settings):
         Pathwise(**settings)
 
 
+def test_networks_that_assets_do_not_share_are_refused():
+    with pytest.raises(QfolioError, match="network is flat; it must be one of mlp, cnn, rnn, lstm"):
+        Pathwise(network="flat")
+
+
 def test_a_rollout_needs_a_second_decision_to_learn_slopes():
     with pytest.raises(QfolioError, match="must be 2 or more"):
         Pathwise(bootstrap=True, rollout_length=20, tail=19)

@@ -108,6 +108,13 @@ def test_the_hidden_pendulum_is_the_pendulum():
         seen, state = after.state, expected.state
 
 
+def test_the_hidden_pendulum_refuses_what_the_pendulum_does():
+    with pytest.raises(QfolioError, match="torques is 1; it must be 0, or from 2 to 1001"):
+        HiddenPendulum(torques=1)
+    with pytest.raises(QfolioError, match="horizon is 6000"):
+        HiddenPendulum(horizon=6000)
+
+
 def test_no_velocity_is_seen_nor_anything_older_than_the_window():
     task = HiddenPendulum(window=4)
     state = task.reset(KEY)

@@ -93,7 +93,7 @@ class DDPG(ActorCritic[Learned]):
     critic_weight_decay: float = constant(0.0)  # coefficient of the critic's L2 penalty
     last_layer_bound: float = constant(0.0)  # last layers start uniform in ± this; 0: in ±1/√inputs
 
-    critics: ClassVar[int] = 1
+    critic_count: ClassVar[int] = 1
 
     def __check_init__(self) -> None:
         scales = "exploration_noise saturation_penalty critic_weight_decay last_layer_bound"
@@ -109,7 +109,7 @@ class DDPG(ActorCritic[Learned]):
         actor_key, critic_key = jax.random.split(key)
         network = self.build(task, observation, outputs_of(task.actions), actor_key)
         actor = Actor(network, task.actions)
-        count, late = self.critics, self.late_action
+        count, late = self.critic_count, self.late_action
         critics = self.build_critics(task, observation, count, critic_key, late=late)
         if bound := self.last_layer_bound:
             both = lambda x: (x[0].network, x[1].networks)  # noqa: E731

@@ -194,10 +194,7 @@ class Pathwise(OnPaths):
     simplex_penalty: float = number(0.01)  # penalty on weights off the simplex
 
     def __check_init__(self) -> None:
-        if self.network not in SHARED:
-            raise QfolioError(
-                f"network is {self.network!r}; it must be one of {', '.join(SHARED)}."
-            )
+        require(self, "network", lambda x: x in SHARED, f"one of {', '.join(SHARED)}")
         require_counts(self, "rollout_length gradient_steps")
         require_counts(self, "tail", 0)
         require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")

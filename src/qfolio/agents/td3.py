@@ -28,7 +28,7 @@ class TD3(DDPG):
     policy_delay: int = static(2)  # critics' steps per step of the actor and the targets
     pessimistic_actor: bool = static(True)  # the actor ascends the smaller value
 
-    critics: ClassVar[int] = 2
+    critic_count: ClassVar[int] = 2
 
     def __check_init__(self) -> None:
         require(self, "target_noise target_noise_clip", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")

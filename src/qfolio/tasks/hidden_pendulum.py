@@ -32,7 +32,7 @@ class HiddenPendulum(Task):
 
     def __check_init__(self) -> None:
         require(self, "window", lambda x: 1 <= x <= 256, "from 1 to 256")
-        self._pendulum.__check_init__()
+        _ = self._pendulum  # which checks its settings
 
     @property
     def _pendulum(self) -> Pendulum:
