@@ -480,7 +480,8 @@ def test_the_first_policy_is_the_same_everywhere():
         (A2C, {"num_envs": 0}, "num_envs of A2C is 0"),
         (REINFORCE, {"initial_std": 0.0}, "initial_std is 0"),
         (REINFORCE, {"episode_steps": 2**31}, "must be from 0 to 2147483647"),
-        (A2C, {"hidden": (0,)}, "must be one or more layer sizes from 1 to"),
+        (A2C, {"hidden": (64, 0)}, "hidden is 64, 0; it must be one or more layer sizes from 1 to"),
+        (A2C, {"hidden": ()}, "hidden is empty; it must be one or more layer sizes from 1 to"),
         (REINFORCE, {"network": "tree"}, "network is tree"),
     ],
 )

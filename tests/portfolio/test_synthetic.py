@@ -178,18 +178,18 @@ def test_regimes_may_differ_in_how_long_they_last_and_what_they_pay():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("name", "value", "shown"),
     [
-        ("stay", "1"),
-        ("stay", "0.9,0.999999"),
-        ("stay", "0.9,0.9,0.9"),
-        ("mean", "0"),
-        ("mean", "0.01,0.001"),
-        ("mean", "-1,0"),
+        ("stay", "1", "1.0"),
+        ("stay", "0.9,0.999999", "0.9, 0.999999"),
+        ("stay", "0.9,0.9,0.9", "0.9, 0.9, 0.9"),
+        ("mean", "0", "0.0"),
+        ("mean", "0.01,0.001", "0.01, 0.001"),
+        ("mean", "-1,0", "-1.0, 0.0"),
     ],
 )
-def test_regimes_that_make_no_sense(name, value):
-    with pytest.raises(QfolioError, match=f"^{name} is "):
+def test_regimes_that_make_no_sense(name, value, shown):
+    with pytest.raises(QfolioError, match=f"^{name} is {shown}; it must be "):
         settings.build(Regime, {name: value})
 
 

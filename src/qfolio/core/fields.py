@@ -77,6 +77,8 @@ def require(instance: Any, names: str, holds: Callable[[Any], bool], wanted: str
     for name in names.split():
         value = getattr(instance, name)
         if isinstance(value, str | int | float | tuple) and not holds(value):  # not while traced
+            if isinstance(value, tuple):
+                value = ", ".join(map(str, value)) or "empty"
             raise QfolioError(f"{name} is {value}; it must be {wanted}.")
 
 

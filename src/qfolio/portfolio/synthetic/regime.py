@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, numbers, require, static
 from qfolio.core.mdp import Policy, Position
 from qfolio.portfolio.market import Relatives
@@ -32,11 +31,9 @@ class Regime(OneAsset):
         require(self, "stay mean", lambda x: len(x) in (1, 2), one_or_two)
         # In longer regimes the search for the bands would take hours.
         require(self, "stay", lambda x: 0 <= min(x) <= max(x) <= 0.9999, "from 0 to 0.9999")
-        if not -0.5 <= self.means[0] < self.means[1] <= 0.5:
-            raise QfolioError(
-                f"mean is {self.mean}; it must be above 0 and at most 0.5, or two numbers from "
-                "-0.5 to 0.5, the smaller one first."
-            )
+        bad, good = self.means
+        require(self, "mean", lambda _: -0.5 <= bad < good <= 0.5, "above 0 and at most 0.5, or "
+                "two numbers from -0.5 to 0.5, the smaller one first")  # fmt: skip
         require_cost(self)
 
     @property
