@@ -140,8 +140,8 @@ def require_memory(tree: Any, count: int) -> None:
     if there is not None and needed > there:
         raise QfolioError(
             f"These settings need {needed / 2**30:,.1f} GiB of memory, but only "
-            f"{there / 2**30:,.1f} are there; lower hidden, the number of seeds, or the "
-            "replay_capacity of an agent that has one."
+            f"{there / 2**30:,.1f} are there; lower the number of seeds, or whichever of "
+            "hidden and replay_capacity the agent has."
         )
 
 

@@ -12,7 +12,10 @@ from typing import Any
 
 from qfolio.core.text import listed
 
-OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
+OUT_OF_MEMORY = (
+    "There is too little memory for these settings; lower the number of seeds, num_envs, or "
+    "whichever of batch_size and hidden the agent has."
+)
 
 
 class QfolioError(Exception):
