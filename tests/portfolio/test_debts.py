@@ -70,7 +70,7 @@ def test_holdings_may_be_short_where_the_mandate_allows_it() -> None:
 def test_a_policy_of_weights_says_what_it_is_for() -> None:
     task = Portfolio.of(planted(200), window=5, horizon=10, mandate=MANDATE)
     ppo = preset("fast", "portfolio", "ppo").build()
-    with pytest.raises(QfolioError, match="which Portfolio has not; set network=mlp"):
+    with pytest.raises(QfolioError, match="which Portfolio has not; set network=flat"):
         ppo.init(task, jnp.zeros(2, jnp.uint32))
 
 

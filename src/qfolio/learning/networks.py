@@ -334,7 +334,7 @@ def _linear(task: Task, observation: PyTree, outputs: Outputs) -> Values | Tilti
         raise QfolioError(
             "network=positions is for portfolios with signals and a mandate without debts, and "
             "either an anchor (such as anchor=equal-weight) or a menu of signals (such as "
-            f"menu=signals:1), which {task.name} has not; set network=mlp."
+            f"menu=signals:1), which {task.name} has not; set network=flat."
         )
     if weights and outputs.each:
         return Tilting(observation, spread=outputs.each > 1)
