@@ -2,16 +2,20 @@
 
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from qfolio.agents.tilts import tilted
+from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Box, Simplex
+from qfolio.core.registry import find
 from qfolio.core.training import begin
 from qfolio.experiments.presets import preset
+from qfolio.learning.networks import last_layer
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.task import Portfolio
@@ -72,6 +76,22 @@ def test_a_policy_of_weights_says_what_it_is_for() -> None:
     ppo = preset("fast", "portfolio", "ppo").build()
     with pytest.raises(QfolioError, match="which Portfolio has not; set network=flat"):
         ppo.init(task, jnp.zeros(2, jnp.uint32))
+
+
+@pytest.mark.parametrize("kind", ["ppo", "sac", "td3"])
+def test_a_network_that_assets_share_tells_them_apart(kind: str) -> None:
+    """In another order, each asset keeps its outputs; means over all would be those of each."""
+    task = Portfolio.of(planted(200), window=5, horizon=10, mandate=MANDATE)
+    agent = settings.build(find("agent", kind), {"network": "mlp", "hidden": (8,)})
+    view, key = task.observe(task.reset(jax.random.key(0))), jax.random.key(1)
+    actor = agent.init(task, key).weights.actor if kind == "ppo" else None
+    network = actor or agent.begin(task, view, key).actor.network
+    network = eqx.tree_at(last_layer, network, replace_fn=lambda x: x + 0.3)
+    order = jnp.array([2, 0, 3, 1, 5, 4])
+    found = network(jax.tree.map(lambda x: x[None], view)).reshape(-1, 6)
+    again = network(jax.tree.map(lambda x: x[None, order], view)).reshape(-1, 6)
+    np.testing.assert_allclose(again, found[:, order], atol=1e-5)
+    assert np.ptp(found, -1).min() > 1e-3
 
 
 @pytest.mark.parametrize("agent", ["tilts", "pathwise"])

@@ -107,7 +107,7 @@ class DDPG(ActorCritic[Learned]):
                 "set torques=0 on the pendulum, or leave menu empty in a market."
             )
         actor_key, critic_key = jax.random.split(key)
-        network = self.build(task, observation, outputs_of(task.actions), actor_key)
+        network = self.build(task, observation, outputs_of(task.actions, observation), actor_key)
         actor = Actor(network, task.actions)
         count, late = self.critic_count, self.late_action
         critics = self.build_critics(task, observation, count, critic_key, late=late)

@@ -130,7 +130,7 @@ class OnPolicy(Agent):
         def build(outputs: Outputs, key: PRNGKeyArray) -> Network:
             return networks.build(self._networks, task, observation, outputs, key)
 
-        actor = build(outputs_of(task.actions), actor_key)
+        actor = build(outputs_of(task.actions, observation), actor_key)
         weights = PolicyAndValue(
             # A last layer of zeros: the first policy is the same everywhere.
             actor=networks.start_at_zero(actor),

@@ -147,14 +147,15 @@ class SAC(ActorCritic[Learned]):
 
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
         actor_key, critic_key = jax.random.split(key)
-        outputs = outputs_of(task.actions)
+        outputs = outputs_of(task.actions, observation)
         if isinstance(task.actions, Discrete):
             make = partial(self.build, task, observation, outputs)
             critics = Critics(make, 2, Scale(self.value_rescaling), critic_key)
         else:
             critics = self.build_critics(task, observation, 2, critic_key)
             weights = isinstance(task.actions, Simplex)  # cash needs no standard deviation
-            outputs = Outputs(1, 2) if weights else Outputs(2 * outputs.pooled)
+            both = Outputs(2 * outputs.pooled, 2 * outputs.each)
+            outputs = Outputs(1, 2) if weights else both
         actor = Actor(self.build(task, observation, outputs, actor_key), task.actions)
         log_temperature = jnp.log(jnp.asarray(self.initial_temperature, float))
         begin = optimizer.begin

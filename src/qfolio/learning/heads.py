@@ -106,7 +106,7 @@ def build(
             "network=positions gives plain action values; set dueling=false, noisy=false and "
             "values=expected."
         )
-    pooled, each, _ = networks.outputs_of(task.actions)
+    pooled, each, _ = networks.outputs_of(task.actions, observation)
     outputs = networks.Outputs((pooled + dueling) * atoms, each * atoms, atoms)
     network = networks.build(config, task, observation, outputs, key)
     if not dueling and noise is None:

@@ -237,12 +237,15 @@ class Outputs(NamedTuple):
         return self.pooled + assets * self.each
 
 
-def outputs_of(actions: Actions) -> Outputs:
-    """One output for each action, weight or coordinate."""
+def outputs_of(actions: Actions, observation: PyTree) -> Outputs:
+    """One output for each action, weight or coordinate, which in a market may be an asset's."""
     if isinstance(actions, Simplex):
         return Outputs(1, 1)
     if isinstance(actions, MenuActions):
         return Outputs(actions.pooled, actions.each)
+    seen = observation.holding.shape if isinstance(observation, View) else ()
+    if isinstance(actions, Box) and seen == (actions.n,):
+        return Outputs(0, 1)
     return Outputs(actions.n)
 
 
