@@ -69,13 +69,13 @@ class OnPaths(Agent):
 
     def _require_whole(self, task: Task) -> None:
         """Raises QfolioError if a rollout would span two episodes."""
-        episode = episode_steps(task, self)
-        if episode % self.rollout_length:
-            most = min(episode, self.rollout_length)
-            fits = next(steps for steps in range(most, 0, -1) if episode % steps == 0)
+        episode, length = episode_steps(task, self), self.rollout_length
+        if episode % length:
+            whole = episode // length * length  # an episode_steps of 0 is the horizon
+            cut = f"episode_steps={whole}" if episode < task.horizon else ""
             raise QfolioError(
-                f"rollout_length is {self.rollout_length}; it must divide the {episode} steps of "
-                f"an episode (episode_steps, or the task's horizon), such as {fits}."
+                f"rollout_length is {length}; it must divide the {episode} steps of an episode; "
+                f"set {cut or f'horizon={whole + length}'}, or another rollout_length."
             )
 
     def _followed(
