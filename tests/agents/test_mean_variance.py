@@ -105,6 +105,7 @@ def test_cap_and_assets_that_cannot_be_traded():
     [
         ({"every": 5}, "divisor"),
         ({"head": 42}, "head"),
+        ({"head": 0}, "head is 0; it must be at least 1"),
         ({"risk_aversion": 0.0}, "risk_aversion"),
         ({"ridge": -1.0}, "ridge"),
         ({"units": 0}, "units"),

@@ -135,7 +135,7 @@ class MeanVariance(Onlooker):
         require_counts(self, "units")
         self._evidence.check()
         require_counts(self, "rollout_length", 2)
-        require(self, "head", lambda x: 0 <= x < self.rollout_length, "at least 0 and below "
+        require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
         require(self, "every", lambda x: x >= 1 and self.rollout_length % x == 0, "a divisor of "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip

@@ -119,8 +119,14 @@ class OnPaths(Agent):
         again = jax.checkpoint(step, policy=kept)
 
         def follow(moves: tuple) -> tuple[Rewards, Rewards]:
-            start = jax.tree.map(lambda x: x[0], moves[0])
-            return lax.scan(again, (start,) * len(trades), (first, *moves[1:]))[1]
+            holding, market, _, anchor, given = jax.tree.map(lambda x: x[0], moves)
+            view = jax.vmap(task.observe)(Position(market, holding))
+            # Held at once: a calendar or a limit might not let the first order lead there.
+            starts = tuple(
+                jax.vmap(task.shift)(holding, target[..., 1:] - view.holding)
+                for target in targets(view._replace(anchor=anchor), given)
+            )
+            return lax.scan(again, starts, (first, *moves[1:]))[1]
 
         market, next_market = rollout.state.market, rollout.next_state.market
         moves = (rollout.state.holding, market, next_market, rollout.observation.anchor, given)
