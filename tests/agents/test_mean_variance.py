@@ -89,6 +89,18 @@ def test_without_evidence_it_is_the_least_variance():
     assert abs(full(view) - least(view)).max() > 0.01
 
 
+def test_members_order_nothing_that_opened_since_the_covariance_was_estimated():
+    """Then it has almost no variance; without expected returns all hold the least variance."""
+    moves = np.random.default_rng(0).normal(0, 0.01, (170, 6)) * [1, 1, 1, 1, 1, 20]
+    members = np.ones(moves.shape, bool)
+    members[:150, -1] = False  # an episode begins at row 126; estimates are from rows 147 and 154
+    table = price_table(np.exp(np.cumsum(moves, 0)), members=members)
+    population = Population(Portfolio.of(table, **TASK), MeanVariance(**SMALL), [0])
+    evidence = train_to(population, 42).fetch().agent.evidence
+    assert evidence.steps.sum() > 0
+    np.testing.assert_allclose(evidence.total, 0.0, atol=1e-5)
+
+
 def test_cap_and_assets_that_cannot_be_traded():
     market = Portfolio.of(prices(changing()), **TASK, max_weight=0.3)
     market = market.part(0, 1000, np.array([True] * 5 + [False]))

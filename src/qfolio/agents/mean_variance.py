@@ -210,10 +210,12 @@ class MeanVariance(Onlooker):
             if learned.members is None:
                 return worse / unit + penalty, (variance, None)
             fixed = lax.stop_gradient(held(sigma))
+            # An asset that has opened since the estimate has almost no variance in it.
+            known = view._replace(anchor=held(some.anchor))
 
             def on_returns(member: Member) -> Array:
-                gain = expected(view, member.means)
-                target = best(view, fixed, gain, actions, lax.stop_gradient(least))
+                gain = expected(known, member.means)
+                target = best(known, fixed, gain, actions, lax.stop_gradient(least))
                 return self._path(task, rollout, member.trading, target)[0]
 
             rewards = jax.vmap(on_returns)(learned.members)
