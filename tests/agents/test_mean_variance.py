@@ -101,6 +101,21 @@ def test_members_order_nothing_that_opened_since_the_covariance_was_estimated():
     np.testing.assert_allclose(evidence.total, 0.0, atol=1e-5)
 
 
+@pytest.mark.parametrize("agent", [MinimumVariance, MeanVariance])
+def test_an_asset_that_has_just_been_listed_gets_no_more_than_its_share(agent):
+    values = np.exp(np.cumsum(np.random.default_rng(0).normal(0, 0.01, (400, 6)), 0))
+    values[:200, -1] = np.nan
+    table = price_table(values, members=np.ones(values.shape, bool))
+    market, held = Portfolio.of(table, **TASK), jnp.eye(7)[0]
+    policy = agent(**SMALL).init(market, jax.random.key(0)).policy
+    members = jax.tree.map(lambda x: x + 0.1, policy.learned.members)
+    policy = eqx.tree_at(lambda one: (one.learned.members, one.share), policy,
+                         (members, jnp.array(1.0)), is_leaf=lambda x: x is None)  # fmt: skip
+    rows = 200 + jnp.array([0, 1, 5, 21, 63])
+    views = jax.vmap(lambda row: market.view(row, market.hold(held)))(rows)
+    assert policy.target(views)[:, -1].max() < 0.3
+
+
 def test_cap_and_assets_that_cannot_be_traded():
     market = Portfolio.of(prices(changing()), **TASK, max_weight=0.3)
     market = market.part(0, 1000, np.array([True] * 5 + [False]))

@@ -4,8 +4,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from qfolio.learning.covariance import Covariance, Means
+from qfolio.core import quadratic
+from qfolio.learning.covariance import STALE, Covariance, Means, filled
 
 ALL = jnp.ones(4, bool)
 
@@ -34,7 +36,7 @@ def test_without_cleaning_it_is_the_second_moments():
 
 def test_half_lives_weigh_late_rows_more():
     rows = np.ones((2, 100))
-    rows[0, :90], rows[1, 90:] = 0.0, 0.5
+    rows[0, :90], rows[1, 90:] = 1e-3, 0.5  # returns of 0 would be unknown
     found = exact(volatility=np.log(10.0))(jnp.asarray(rows), jnp.ones(2, bool))
     early = 0.5 - 0.5**10  # what the rows before the last ten weigh, over all but what is cut
     ratio = (0.5 / (early + 0.5 * 0.25)) * 1.0
@@ -71,6 +73,50 @@ def test_assets_that_are_not_open_count_for_nothing():
     kept = np.array([0, 1, 3])
     wanted = start(seen[kept], jnp.ones(3, bool))
     np.testing.assert_allclose(found[np.ix_(kept, kept)], wanted, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.5])
+@pytest.mark.parametrize("rows", [0, 1, 5, 21, 63, 252])
+def test_a_new_asset_is_held_like_the_others(rows, alike):
+    """From its first row on it has about a tenth; as if its unknown returns were 0, almost all."""
+    rng = np.random.default_rng(0)
+    own, common = rng.normal(0, 0.01, (10, 504)), rng.normal(0, 0.01, (1, 504))
+    seen = np.sqrt(1 - alike) * own + np.sqrt(alike) * common
+    seen[0, : 504 - rows] = 0.0
+    every = jnp.ones(10, bool)
+    sigma = Covariance(3, jax.random.key(0))(jnp.asarray(seen, jnp.float32), every)
+    assert 0.03 < float(quadratic.best(sigma, jnp.zeros(10), every)[0]) < 0.17
+
+
+def test_what_is_unknown_has_the_mean_variance_and_the_mean_correlation():
+    seen = returns(rows=2000).at[3].set(0.0)
+    found = np.asarray(exact()(seen, ALL))
+    known = np.asarray(seen[:3] @ seen[:3].T) / 2000
+    np.testing.assert_allclose(found[3, 3] / np.diag(found)[:3].mean(), 1.0, rtol=1e-3)
+    mean, typical = known.mean(), np.trace(known) / 3
+    alike = (3 * mean / typical - 1) / 2
+    np.testing.assert_allclose(found[3, :3].mean() / found[3, 3], alike, rtol=1e-2)
+
+
+def test_only_what_is_unknown_is_filled():
+    seen = np.array(returns())
+    seen[0, :STALE], seen[1, : STALE + 1], seen[2] = 0.0, 0.0, 0.0
+    kept, none = filled(jnp.asarray(seen), jnp.array([True, False, False, True]))
+    np.testing.assert_array_equal(kept, seen)
+    assert not none.any()
+    some, missing = filled(jnp.asarray(seen), jnp.array([True, True, False, True]))
+    unknown = np.zeros(seen.shape, bool)
+    unknown[1, : STALE + 1] = True
+    np.testing.assert_array_equal(missing > 0, unknown)
+    np.testing.assert_array_equal(np.where(unknown, 0, some), np.where(unknown, 0, seen))
+    assert some[unknown].all()
+
+
+def test_a_new_asset_is_not_expected_to_earn_or_lose_much():
+    """A single return over the root mean square of a window of zeros would be a large number."""
+    seen = returns().at[0, :-1].set(0.0)
+    means = eqx.tree_at(lambda m: m.coefficients, Means(), jnp.array([1.0, 0.0, 0.0, 0.0]))
+    assert abs(means(seen, ALL)).max() < 3
 
 
 def test_learned_parts_all_have_gradients_also_with_fewer_rows_than_assets():

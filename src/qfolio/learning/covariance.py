@@ -13,15 +13,20 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from qfolio.core.symmetric import spectrum
+from qfolio.learning.trading import ratio
 
 LEAST = 1e-3
 """Smaller eigenvalues of correlations are raised to this."""
 
 TINY = 1e-9
 """Added to variances, in units of the squared scale of returns."""
+
+STALE = 21
+"""Most returns of 0 at the start of a window that count as days without a move, not as unknown."""
 
 
 class Covariance(eqx.Module):
@@ -72,21 +77,25 @@ class Covariance(eqx.Module):
         returns: in the same unit for all assets, the latest last. open_to: the assets that can be
         traded.
         """
-        returns = self._limited(jnp.where(open_to[..., None], returns, 0.0))
+        returns, missing = filled(returns, open_to)
+        returns = self._limited(jnp.where(open_to[..., None], returns, 0.0), missing)
         weights = _decay(self.correlation, returns.shape[-1])
         seen = returns * jnp.sqrt(weights)
         count = jnp.maximum(open_to.sum(-1, keepdims=True), 1)
-        cleaned = self._cleaned(
-            _correlations(jnp.einsum("...at,...bt->...ab", seen, seen)), count * (weights**2).sum()
-        )
-        variance = (returns**2 @ _decay(self.volatility, returns.shape[-1])) + TINY
+        moments = jnp.einsum("...at,...bt->...ab", seen, seen)
+        # Fixed, so that the gradients of complete windows are rounded as without it.
+        unknown = missing @ lax.stop_gradient(weights)
+        moments += unknown[..., None] * jnp.eye(moments.shape[-1])
+        cleaned = self._cleaned(_correlations(moments), count * (weights**2).sum())
+        variance = ((returns**2 + missing) @ _decay(self.volatility, returns.shape[-1])) + TINY
         scale = jnp.sqrt(variance / (variance.sum(-1, keepdims=True) / count))
         return cleaned * scale[..., :, None] * scale[..., None, :]
 
     def _limited(
-        self, returns: Float[Array, "*batch asset time"]
+        self, returns: Float[Array, "*batch asset time"], missing: Float[Array, "*batch asset time"]
     ) -> Float[Array, "*batch asset time"]:
-        limit = jnp.exp(self.limit) * jnp.sqrt((returns**2).mean(-1, keepdims=True) + TINY)
+        square = (returns**2 + missing).mean(-1, keepdims=True)
+        limit = jnp.exp(self.limit) * jnp.sqrt(square + TINY)
         return limit * jnp.tanh(returns / limit)
 
     def _cleaned(
@@ -129,13 +138,44 @@ class Means(eqx.Module):
         self, returns: Float[Array, "*batch asset time"], open_to: Bool[Array, "*batch asset"]
     ) -> Float[Array, "*batch asset"]:
         weights = jax.vmap(lambda one: _decay(one, returns.shape[-1]), out_axes=1)(self.half_lives)
-        spread = jnp.sqrt((returns**2).mean(-1, keepdims=True) + TINY)
+        returns, missing = filled(returns, open_to)
+        spread = jnp.sqrt((returns**2 + missing).mean(-1, keepdims=True) + TINY)
         # A mean over more days is smaller; divided by its standard error, it is not.
         means = (returns / spread) @ (weights / jnp.sqrt((weights**2).sum(0)))
         means = jnp.where(open_to[..., None], means, 0.0)
         count = jnp.maximum(open_to.sum(-1), 1)[..., None, None]
         centered = means - means.sum(-2, keepdims=True) / count
         return jnp.where(open_to, centered @ self.coefficients, 0.0)
+
+
+def filled(
+    returns: Float[Array, "*batch asset time"], open_to: Bool[Array, "*batch asset"]
+) -> tuple[Float[Array, "*batch asset time"], Float[Array, "*batch asset time"]]:
+    """Returns with expected ones in place of unknown ones, and the variances of what is unknown.
+
+    Returns from before an asset's first price are 0, so that a new asset would seem to have no
+    risk. It is taken for one like the others: as if all had the same variance v and correlation ρ,
+    its return is expected from the mean of theirs on that day.
+    """
+    rows = jnp.arange(returns.shape[-1])
+    first = jnp.where(returns != 0, rows, len(rows)).min(-1, keepdims=True)
+    known = (rows >= first) | (first <= STALE) | ~open_to[..., None]
+    there = known & open_to[..., None]
+
+    def fill() -> tuple[Array, Array]:
+        count = 1.0 * there.sum(-2, keepdims=True)
+        mean = ratio(jnp.where(there, returns, 0.0).sum(-2, keepdims=True), count)
+        total, days = count.sum(-1, keepdims=True), 1.0 * (count > 0).sum(-1, keepdims=True)
+        variance = ratio(jnp.where(there, returns**2, 0.0).sum((-2, -1), keepdims=True), total)
+        of_mean, assets = ratio((mean**2).sum(-1, keepdims=True), days), ratio(total, days)
+        # The mean of n assets has the variance v (ρ + (1 − ρ)/n).
+        alike = ratio(assets * of_mean - variance, (assets - 1) * variance).clip(0.0, 1.0)
+        slope = ratio(alike * variance, of_mean)
+        left = (1 - slope * alike) * variance
+        return jnp.where(known, returns, slope * mean), jnp.where(known, 0.0, left)
+
+    # Most windows have nothing to fill, and skip the work.
+    return lax.cond(known.all(), lambda: (returns, jnp.zeros_like(returns)), fill)
 
 
 def _decay(half_life: Float[Array, ""], rows: int) -> Float[Array, " time"]:
