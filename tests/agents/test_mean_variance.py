@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.agents.mean_variance import MeanVariance, MinimumVariance
+from qfolio.agents.mean_variance import MeanVariance, MinimumVariance, best
 from qfolio.core.errors import QfolioError
+from qfolio.core.market import View
+from qfolio.core.mdp import Simplex
 from qfolio.core.population import Population
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
@@ -125,6 +127,15 @@ def test_cap_and_assets_that_cannot_be_traded():
     np.testing.assert_allclose(weights.sum(), 1, atol=1e-5)
     assert weights[1:].max() <= 0.3 + 1e-6
     assert weights[-1] == 0
+
+
+def test_the_cap_is_one_of_weights_whatever_the_anchor_invests():
+    sigma = jnp.diag(jnp.array([0.001, 1.0, 1.0, 1.0, 1.0]))
+    for invested, most in ((1.0, 0.3), (0.5, 0.3), (0.2, 0.2), (0.0, 0.0)):
+        view = View(jnp.zeros((5, 1, 1)), jnp.zeros(5), jnp.full(5, invested / 5))
+        weights = best(view, sigma, None, Simplex(5, 0.3))
+        others = [(invested - most) / 4] * 4
+        np.testing.assert_allclose(weights, [1 - invested, most, *others], atol=0.01 * invested)
 
 
 @pytest.mark.parametrize(

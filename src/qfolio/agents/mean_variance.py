@@ -26,7 +26,7 @@ from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.covariance import Covariance, Means
 from qfolio.learning.evidence import Evidence, EvidenceConfig, blocks_of, left_out
-from qfolio.learning.trading import Trading
+from qfolio.learning.trading import Trading, ratio
 
 
 class Member(eqx.Module):
@@ -96,7 +96,9 @@ def best(
     total = view.anchor.sum(-1, keepdims=True)
     gain = jnp.zeros_like(view.anchor) if gain is None else gain
     start = None if near is None else near[..., 1:] / total
-    wanted = quadratic.best(sigma, gain, view.anchor > 0, actions.cap, start)
+    # Caps are of weights, and what is found here are shares of what is invested.
+    cap = 1.0 if actions.cap == 1 else jnp.minimum(ratio(actions.cap, total), 1.0)
+    wanted = quadratic.best(sigma, gain, view.anchor > 0, cap, start)
     return jnp.concatenate([1 - total, total * wanted], -1)
 
 

@@ -21,7 +21,7 @@ def best(
     covariance: Float[Array, "*batch asset asset"],
     gain: Float[Array, "*batch asset"],
     open_to: Bool[Array, "*batch asset"],
-    cap: Float[Array, ""] | float = 1.0,
+    cap: Float[Array, "*batch 1"] | Float[Array, ""] | float = 1.0,
     near: Float[Array, "*batch asset"] | None = None,
 ) -> Float[Array, "*batch asset"]:
     """The weights w that maximize gain·w − w'Σw/2 with 1'w = 1, 0 ≤ w ≤ cap, and 0 if not open.
