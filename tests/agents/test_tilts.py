@@ -13,11 +13,12 @@ from qfolio.agents.tilts import Deep, Tilt, TiltPolicy, Tilts, tilted
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
-from qfolio.core.mdp import Simplex
+from qfolio.core.mdp import Position, Simplex, Transition
 from qfolio.core.population import Population, programs_of
-from qfolio.learning.evidence import Evidence, left_out
+from qfolio.learning.evidence import Evidence, blocks_of, left_out
 from qfolio.learning.scores import Hidden
 from qfolio.learning.trading import Trading
+from qfolio.portfolio.synthetic.kelly import Kelly
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
@@ -210,6 +211,14 @@ def test_a_network_learns_from_every_fourth_path():
     state = trained(random_walk(300, 3, seed=3), rounds=2)
     counted = state.evidence_of_depth.steps.sum() / state.evidence.steps.sum()
     np.testing.assert_allclose(counted, 1 / 4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("members", [2, 3, 4, 5])
+def test_each_member_gives_evidence_of_a_network_where_moves_are_drawn_anew(members):
+    rollout = Transition(Position(jnp.zeros((2, 24)), None), *[jnp.zeros(())] * 7)
+    block = blocks_of(Kelly(), rollout, 32, tilts.EVERY)
+    np.testing.assert_array_equal(np.sort(block[0]), np.arange(24))
+    assert left_out(block[:, :: tilts.EVERY], members).any((1, 2)).all()
 
 
 def test_a_network_without_evidence_is_not_followed():

@@ -254,7 +254,7 @@ class Tilts(Onlooker):
         self, task: Task, state: TiltsState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[TiltsState, Metrics]:
         assert isinstance(task, ExogenousTask)
-        block = blocks_of(task, rollout, self.blocks)
+        block = blocks_of(task, rollout, self.blocks, EVERY)
         counted = jnp.arange(self.rollout_length)[:, None] >= self.head
         left = left_out(block, self.members)
         seen, unseen = counted & ~left, counted & left

@@ -90,10 +90,17 @@ def block_of(task: ExogenousTask, market: PyTree, blocks: int) -> Int[Array, ""]
     return jnp.minimum((blocks * share).astype(jnp.int32), blocks - 1)
 
 
-def blocks_of(task: ExogenousTask, rollout: Transition, blocks: int) -> Int[Array, "time path"]:
-    """The block of each step; if moves are drawn anew, each path belongs to one block."""
+def blocks_of(
+    task: ExogenousTask, rollout: Transition, blocks: int, every: int = 1
+) -> Int[Array, "time path"]:
+    """The block of each step; if moves are drawn anew, each path belongs to one block.
+
+    Then every ``every``-th path is in the next block, so that these alone are in many, too.
+    """
     found = jax.vmap(jax.vmap(lambda one: block_of(task, one, blocks)))(rollout.state.market)
-    own = jnp.arange(found.shape[1]) % blocks
+    count = found.shape[1]
+    path, rounds = jnp.arange(count), -(-count // every)
+    own = (path % every * rounds + path // every) % blocks
     return jnp.where(jnp.isfinite(task.moves), found, own)
 
 
