@@ -10,6 +10,8 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.ppo import PPO
 from qfolio.core.devices import Members, configure
 from qfolio.core.errors import QfolioError
+from qfolio.core.fields import number
+from qfolio.core.mdp import Step
 from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin, chunk_steps
 
@@ -210,6 +212,24 @@ def test_an_infinite_loss_stops_training(task, changes, says):
     population = Population(task, agent, [4, 5])
     population.advance(1000)  # warm-up
     with pytest.raises(QfolioError, match=says):
+        population.advance(1000)
+
+
+class Overflowing(Endless):
+    """Rewards that are infinite where its payment is."""
+
+    payment: float = number(1.0)
+
+    def step(self, state, action, key):
+        return Step(state, jnp.asarray(self.payment), jnp.array(False))
+
+
+def test_a_fault_is_sought_in_the_task_of_the_member_that_failed():
+    agent = DQN(hidden=(4,), num_envs=2, batch_size=8, learning_starts=4)
+    tasks = [Overflowing(), Overflowing(payment=float("inf"))]
+    population = Population(tasks, agent, [4, 5])
+    population.advance(1000)  # warm-up
+    with pytest.raises(QfolioError, match="With seed 5, the reward of Overflowing is not finite"):
         population.advance(1000)
 
 

@@ -222,7 +222,7 @@ class HostPopulation(Population):
             self._require_healthy()
         return records
 
-    def task_fault(self) -> None:
+    def task_fault(self, member: int = 0) -> None:
         """None: what an environment returns is checked at each step."""
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:

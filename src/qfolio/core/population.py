@@ -55,7 +55,8 @@ class Population:
         self.task, self.agent = tasks[0], agents[0]
         self._tail = max(tail_steps(agent.discount) for agent in agents)
         self.seconds_compile = 0.0
-        own, self._shared, self._join, form = _split(list(zip(tasks, agents, strict=True)))
+        self._pairs = list(zip(tasks, agents, strict=True))
+        own, self._shared, self._join, form = _split(self._pairs)
         self._begin(own, form)
 
     def _require_memory(self) -> None:
@@ -154,8 +155,9 @@ class Population:
     def _require_healthy(self) -> None:
         healthy = self.healthy
         if not all(healthy):
-            if fault := self.task_fault():
-                raise QfolioError(fault)
+            first = healthy.index(False)
+            if fault := self.task_fault(first):
+                raise QfolioError(f"With seed {self.seeds[first]}, {fault[0].lower()}{fault[1:]}")
             bad = {str(s): None for s, ok in zip(self.seeds, healthy, strict=True) if not ok}
             raise QfolioError(
                 f"The loss of seed {', '.join(bad)} is no longer finite after {self.steps} steps; "
@@ -163,9 +165,9 @@ class Population:
                 "whichever the agent has)."
             )
 
-    def task_fault(self) -> str | None:
-        """What is wrong with the task, if the fault is not in the learning."""
-        return faults.find(self.task, self.agent, self.seeds[0])
+    def task_fault(self, member: int = 0) -> str | None:
+        """What is wrong with a member's task, if the fault is not in the learning."""
+        return faults.find(*self._pairs[member], self.seeds[member])
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
         """Greedy returns (member, start) and overestimation (member,) of the current policies.
