@@ -56,6 +56,23 @@ def test_states_beyond_the_last_are_refused(kind):
         train(Longer(), kind(), steps=400)
 
 
+class Beyond(Longer):
+    """It begins in a cell that it does not have, and goes back to the others."""
+
+    def reset(self, key):
+        return jnp.array(5, jnp.int32)
+
+    def step(self, state, action, key):
+        return Step(jnp.maximum(state - 4, 0), jnp.array(1.0), jnp.array(False))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_start_beyond_the_last_state_is_refused(kind):
+    """What is learned of it would be dropped without a word."""
+    with pytest.raises(QfolioError, match="observation of Beyond is not from 0 to 2 at the start"):
+        train(Beyond(), kind(), steps=400)
+
+
 def trained(task, agent, steps, seeds=(100,)):
     """Learned action values (seed, state, action)."""
     population = train_to(Population(task, agent, seeds), steps)

@@ -127,7 +127,11 @@ class Tabular(Agent):
     def learn(
         self, task: Task, state: State, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[State, Metrics]:
-        state = self.improve(state, Move.of(rollout), key)
+        move, states = Move.of(rollout), state.cells.shape[1]
+        # What is added beyond a table is dropped: a state that is none spoils the first instead.
+        there = (move.state >= 0) & (move.state < states)
+        seen, reward = jnp.where(there, move.state, 0), jnp.where(there, move.reward, jnp.nan)
+        state = self.improve(state, move._replace(state=seen, reward=reward), key)
         return self.observe(state, rollout), {}
 
     @abc.abstractmethod
@@ -152,8 +156,8 @@ class Tabular(Agent):
         value, visits = cells[entry].T
         error = td_target(move.reward, move.terminated, following, self.discount) - value
         # An array that is read beyond its end gives its last entry, so two states would share it.
-        both = jnp.stack([move.state, move.next_state])
-        error = jnp.where(((both >= 0) & (both < states)).all(0), error, jnp.nan)
+        there = (move.next_state >= 0) & (move.next_state < states)
+        error = jnp.where(there, error, jnp.nan)
         rate = self.learning_rate / (1 + self.learning_rate_decay * visits)
         step = jnp.stack([step_share(entry, rate) * error, jnp.ones_like(error)], 1)
         if len(entry) == 1:  # a dummy row: XLA scatters two in place, but not one
