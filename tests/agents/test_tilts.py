@@ -268,8 +268,8 @@ def test_a_rollout_must_not_span_two_episodes():
     refused = lambda says: pytest.raises(QfolioError, match=f"must divide the {says}, or another ")  # noqa: E731
     with refused("50 steps of an episode; set horizon=84"):
         Tilts(**SMALL).init(task, jax.random.key(0))
-    for steps, fits in ((48, 42), (40, 0)):
-        with refused(f"{steps} steps of an episode; set episode_steps={fits}"):
+    for steps, fits in ((48, "episode_steps=42"), (40, "horizon=42 and episode_steps=0")):
+        with refused(f"{steps} steps of an episode; set {fits}"):
             Tilts(**SMALL, episode_steps=steps).init(task, jax.random.key(0))
 
 

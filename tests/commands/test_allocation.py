@@ -145,7 +145,6 @@ def test_after_its_trades_an_allocation_is_not_made_again(copy, monkeypatch, cap
     held = ["allocate", copy, *AS_OF, "--holdings", holdings]
     assert qfolio(monkeypatch, *held, *of) == 2
     assert "those of record 1 of 2020-09-16 after its trades, so that" in capsys.readouterr().err
-    assert not path.exists()
     assert [record["trades"] for record in records(copy)] == [
         [row["trade_shares"] for row in plan["assets"]]
     ]
@@ -154,13 +153,15 @@ def test_after_its_trades_an_allocation_is_not_made_again(copy, monkeypatch, cap
     assert "It supersedes record 1 of the same date" in capsys.readouterr().out
 
 
-def test_a_refusal_leaves_no_earlier_orders(folder, monkeypatch, capsys, tmp_path):
-    path = tmp_path / "orders.csv"
-    for more, kept in (([], False), (["--dry-run"], True)):
-        path.write_text("date,symbol\n")
-        assert qfolio(monkeypatch, "allocate", folder, "--capital", 1, "--orders", path, *more) == 2
-        assert "stale" in capsys.readouterr().err
-        assert path.exists() == kept
+def test_a_deposit_after_the_trades_is_invested(copy, monkeypatch, capsys, tmp_path):
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    holdings = tmp_path / "holdings.csv"
+    plan = allocation(copy, monkeypatch, capsys, "--agent", "equal-weight", "--capital", 3000)
+    lines = [f"{row['asset']},{row['trade_shares']}" for row in plan["assets"]]
+    holdings.write_text("\n".join(["asset,shares", *lines, "cash,500", ""]))
+    of = ["allocate", copy, *AS_OF, "--holdings", holdings, "--agent", "equal-weight"]
+    assert qfolio(monkeypatch, *of) == 0
+    assert sum(records(copy)[-1]["weights_before"][1:]) < 0.9 < sum(records(copy)[-1]["target"][1:])
 
 
 def test_many_shares_are_shown_with_all_digits(folder, monkeypatch, capsys):
@@ -505,7 +506,7 @@ def test_orders_as_csv(folder, monkeypatch, capsys, tmp_path):
     assert "--layout is 'x'; choose from generic, ib, alpaca, schwab" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--prices", "--holdings"])
+@pytest.mark.parametrize("option", ["--prices", "--holdings", "--members"])
 def test_orders_do_not_replace_an_input(option, folder, monkeypatch, capsys, tmp_path):
     path = tmp_path / "table.csv"
     path.write_text("asset,shares\ncash,1\n")

@@ -112,6 +112,14 @@ def test_only_what_is_unknown_is_filled():
     assert some[unknown].all()
 
 
+def test_a_new_asset_is_one_of_ten_in_a_short_window():
+    seen = np.random.default_rng(0).normal(0, 0.05, (10, 20))
+    seen[0] = 0.0
+    returns, open_to = jnp.array(seen, jnp.float32), jnp.ones(10, bool)
+    sigma = Covariance(3, jax.random.key(0))(returns, open_to)
+    assert quadratic.best(sigma, jnp.zeros(10), open_to)[0] < 0.2
+
+
 def test_a_new_asset_is_not_expected_to_earn_or_lose_much():
     """A single return over the root mean square of a window of zeros would be a large number."""
     seen = returns().at[0, :-1].set(0.0)

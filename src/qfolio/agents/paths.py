@@ -71,11 +71,13 @@ class OnPaths(Agent):
         """Raises QfolioError if a rollout would span two episodes."""
         episode, length = episode_steps(task, self), self.rollout_length
         if episode % length:
-            whole = episode // length * length  # an episode_steps of 0 is the horizon
-            cut = f"episode_steps={whole}" if episode < task.horizon else ""
+            whole = episode // length * length
+            fits = f"horizon={whole + length}"
+            if episode < task.horizon:  # an episode_steps of 0 is the horizon
+                fits = f"episode_steps={whole}" if whole else f"{fits} and episode_steps=0"
             raise QfolioError(
                 f"rollout_length is {length}; it must divide the {episode} steps of an episode; "
-                f"set {cut or f'horizon={whole + length}'}, or another rollout_length."
+                f"set {fits}, or another rollout_length."
             )
 
     def _followed(

@@ -63,7 +63,7 @@ def allocate(
             farther apart than a day (default: today).
         update: Update the policy on the new rows first, and store the new version beside the
             earlier ones.
-        orders: Write the trades to this CSV file. One with earlier trades is removed in any case.
+        orders: Write the trades to this CSV file.
         layout: Columns of that file: generic, ib for a basket of Interactive Brokers, or alpaca or
             schwab for the fields of an order in their APIs.
         currency: Currency in that file, where the layout names one.
@@ -74,12 +74,10 @@ def allocate(
         returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
             shares and orders need prices (default: they are prices).
     """
-    if orders is not None:
-        for option, file in {"--prices": prices, "--holdings": holdings}.items():
-            if file is not None and file.resolve() == orders.resolve():
-                raise QfolioError(f"{option} and --orders name one file; give orders their own.")
-        if orders.is_file() and reproduce is None and not dry_run:
-            orders.unlink()  # if anything is refused below, none are left that could be sent again
+    inputs = {"--prices": prices, "--holdings": holdings, "--members": latest.members}
+    for option, file in inputs.items():
+        if orders is not None and file is not None and file.resolve() == orders.resolve():
+            raise QfolioError(f"{option} and --orders name one file; give orders their own.")
     import msgspec
     import numpy as np
 

@@ -7,6 +7,7 @@ from time import perf_counter
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
@@ -55,8 +56,7 @@ class Population:
         self.task, self.agent = tasks[0], agents[0]
         self._tail = max(tail_steps(agent.discount) for agent in agents)
         self.seconds_compile = 0.0
-        self._pairs = list(zip(tasks, agents, strict=True))
-        own, self._shared, self._join, form = _split(self._pairs)
+        own, self._shared, self._join, form = _split(list(zip(tasks, agents, strict=True)))
         self._begin(own, form)
 
     def _require_memory(self) -> None:
@@ -167,7 +167,9 @@ class Population:
 
     def task_fault(self, member: int = 0) -> str | None:
         """What is wrong with a member's task, if the fault is not in the learning."""
-        return faults.find(*self._pairs[member], self.seeds[member])
+        own = jax.tree.map(lambda leaf: jnp.asarray(leaf[member]), self._members.fetch(self._own))
+        task, agent = self._join(own, self._shared)
+        return faults.find(task, agent, self.seeds[member])
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
         """Greedy returns (member, start) and overestimation (member,) of the current policies.

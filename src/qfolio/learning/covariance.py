@@ -26,7 +26,8 @@ TINY = 1e-9
 """Added to variances, in units of the squared scale of returns."""
 
 STALE = 21
-"""Most returns of 0 at the start of a window that count as days without a move, not as unknown."""
+"""Most returns of 0 at the start of a window that count as days without a move, not as unknown; at
+most a quarter of the window."""
 
 
 class Covariance(eqx.Module):
@@ -159,7 +160,7 @@ def filled(
     """
     rows = jnp.arange(returns.shape[-1])
     first = jnp.where(returns != 0, rows, len(rows)).min(-1, keepdims=True)
-    known = (rows >= first) | (first <= STALE) | ~open_to[..., None]
+    known = (rows >= first) | (first <= min(STALE, len(rows) // 4)) | ~open_to[..., None]
     there = known & open_to[..., None]
 
     def fill() -> tuple[Array, Array]:

@@ -65,7 +65,8 @@ def test_a_year_of_last_trading_days_has_all_its_months(months, rows):
 def test_a_whole_fold_of_months_is_one_whatever_their_length(offset, months, test):
     """Walking forward, the next fold begins right after it."""
     following = np.datetime64("1983-02") + np.arange(0, 80 * months, months).astype("m8[M]")
-    dates = np.busday_offset(following.astype("M8[D]") + max(offset, 0), min(offset, 0), "forward")
+    later = np.timedelta64(max(offset, 0), "D")
+    dates = np.busday_offset(following.astype("M8[D]") + later, min(offset, 0), "forward")
     for first in range(12):
         some = dates[first:]
         fold = walk_forward(some, "3y", test, 0)[0]
@@ -87,7 +88,8 @@ def test_a_whole_fold_of_months_is_one_whatever_their_length(offset, months, tes
     ],
 )
 def test_a_policy_is_overdue_after_a_whole_test(learned, test, last, due):
-    dates = np.arange("2020-01-01", np.datetime64(last) + 1, dtype="datetime64[D]")
+    end = np.datetime64(last) + np.timedelta64(1, "D")
+    dates = np.arange("2020-01-01", end, dtype="datetime64[D]")
     assert overdue(np.datetime64(learned), test, dates) == due
 
 

@@ -142,7 +142,7 @@ def test_rows_that_move_the_folds_are_refused():
     following = np.datetime64("2000-02") + np.arange(ROWS).astype("m8[M]")
     dates = np.busday_offset(following.astype("M8[D]"), -1, roll="forward")
     months = changed(dates=dates).between(0, FIRST)
-    dates[FIRST] = dates[FIRST - 1] + 2
+    dates[FIRST] = dates[FIRST - 1] + np.timedelta64(2, "D")
     run = Backtest.create(months, {"pathwise": AGENT}, train="5y", test="1y", seeds=1, baselines=())
     message = r"folds begin on other dates \(first: \d+-\d+-\d+, now .*\); start a new backtest"
     with pytest.raises(QfolioError, match=message):

@@ -98,8 +98,9 @@ def test_prices_that_may_be_late_are_no_delisting(desk):
         with pytest.raises(QfolioError) as error:
             desk.read(Path(str(rows)))
         assert str(error.value) == (
-            f"The prices end on {table(rows).dates[-1].astype('M8[D]')}, but earlier those of D "
-            "(2024-05-24); fetch them again or, if the assets were delisted, add --ended cash-out."
+            f"The prices end on {table(rows).dates[-1].astype('M8[D]')}, but those of D "
+            "(2024-05-24) end earlier; fetch them again or, if the assets were delisted, add "
+            "--ended cash-out."
         )
     assert desk.read(Path(str(NOW + 1))).listed is not None
     known = Desk(desk.run, desk.folder, desk.inspect, delists=True)
@@ -127,8 +128,10 @@ def test_memberships_that_have_ended_are_refused(desk, tmp_path):
     path = tmp_path / "latest.csv"
     table(FIRST + 5).to_frame().to_csv(path)
     spans = pd.DataFrame({"asset": ASSETS, "from": "2020-01-01", "to": "2024-05-23"})
+    ended = Desk.open(desk.folder, members=spans)
     with pytest.raises(QfolioError, match=r"^No asset may be held on 2024-05-24, .* --members\.$"):
-        Desk.open(desk.folder, members=spans).read(path)
+        ended.table(ended.followed("equal-weight"), path)
+    ended.read(path)  # to value what is held
     spans.loc[0, "to"] = None
     there = Desk.open(desk.folder, members=spans).read(path).members
     assert there is not None

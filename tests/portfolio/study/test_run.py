@@ -140,7 +140,7 @@ def test_a_backtest_that_has_gone_on_beyond_its_table_is_not_pooled(finished, tm
     place = folder / "tables/one/lag1-10bp"
     returns, summary = place / "returns.csv", place / "summary.json"
     content = json.loads(summary.read_text())
-    day = str(TABLES["one"].dates[-1].astype("datetime64[D]") + 1)
+    day = str(TABLES["one"].dates[-1].astype("datetime64[D]") + np.timedelta64(1, "D"))
     with returns.open("a") as file:
         file.write(",".join([day, *returns.read_text().splitlines()[-1].split(",")[1:]]) + "\n")
     summary.write_text(json.dumps({**content, "periods": content["periods"] + 1}))

@@ -120,15 +120,26 @@ class Desk:
         )
 
     def table(self, followed: Policy | Untrained, prices: Path | None) -> Prices:
-        """The prices to decide on (default: those of the backtest)."""
-        return self.run.prices if prices is None else followed.table(self.read(prices))
+        """The prices to decide on (default: those of the backtest).
+
+        Raises QfolioError, also if no asset may be held at their last row.
+        """
+        if prices is None:
+            return self.run.prices
+        table = self.read(prices)
+        if (there := table.tradable) is not None and not there[-1].any():
+            raise QfolioError(
+                f"No asset may be held on {day(table.dates[-1])}, so that all would be sold; give "
+                "the latest memberships with --members."
+            )
+        return followed.table(table)
 
     def read(self, prices: Path | None) -> Prices:
         """The latest prices of the backtest's assets (default: those of the backtest).
 
         Raises:
-            QfolioError: They cannot be read, are of other assets or another frequency, or end too
-                early of some asset; or no asset may be held at their last row.
+            QfolioError: They cannot be read, are of other assets or another frequency, or those of
+                some asset end early.
         """
         if prices is None:
             return self.run.prices
@@ -142,11 +153,6 @@ class Desk:
         table = table.exactly(self.run.prices.assets, "the backtest")
         require_alike(table.dates, self.run.prices.periods_per_year, "the backtest has")
         self._require_last_prices(table)
-        if (there := table.tradable) is not None and not there[-1].any():
-            raise QfolioError(
-                f"No asset may be held on {day(table.dates[-1])}, so that all would be sold; give "
-                "the latest memberships with --members."
-            )
         return table
 
     def _require_last_prices(self, table: Prices) -> None:
@@ -155,9 +161,9 @@ class Desk:
         late = [] if listed is None else [j for j in ended if listed[-1 - LATE :, j].any()]
         if late and not self.delists:
             raise QfolioError(
-                f"The prices end on {day(table.dates[-1])}, but earlier those of "
-                f"{_with_ends(table, late)}; fetch them again or, if the assets were delisted, add "
-                "--ended cash-out."
+                f"The prices end on {day(table.dates[-1])}, but those of {_with_ends(table, late)} "
+                "end earlier; fetch them again or, if the assets were delisted, add --ended "
+                "cash-out."
             )
 
     def _ended(self, table: Prices) -> list[int]:

@@ -23,6 +23,9 @@ from qfolio.portfolio.prices.table import Prices
 
 FORMAT = 1
 
+FEES = 0.05
+"""How far cash may be from what a record expects after its trades, as a share of what they move."""
+
 # Names become paths.
 PolicyName = Annotated[str, msgspec.Meta(pattern=r"^latest(-[0-9]+)?$")]
 
@@ -263,9 +266,17 @@ def _inputs(record: Record | dict[str, Any]) -> dict[str, Any]:
 
 
 def _traded(before: Record, content: dict[str, Any]) -> bool:
-    """Whether holdings are those of a record after its trades; prices and fees decide on cash."""
+    """Whether holdings are those of a record after its trades.
+
+    Prices and fees decide on the cash: what differs by more is a deposit or a withdrawal.
+    """
     after = np.add(before.shares, before.trades)
-    return any(before.trades) and np.allclose(content["shares"], after, rtol=1e-9, atol=1e-5)
+    traded = np.nansum(np.abs(np.multiply(before.trades, np.array(before.prices, float))))
+    return (
+        any(before.trades)
+        and np.allclose(content["shares"], after, rtol=1e-9, atol=1e-5)
+        and abs(content["cash"] - before.cash_after) <= FEES * traded
+    )
 
 
 def _differing(before: Record, content: dict[str, Any]) -> list[str]:

@@ -234,7 +234,7 @@ def _report_filled(grid: Grid, gaps: np.ndarray, findings: Findings) -> None:
     findings.warn(
         f"filled forward: {amount(int(gaps.sum()), 'missing price')}; "
         f"the longest gap is of {quote(grid.assets[j])}, {amount(int(longest[j]), 'row')}; "
-        "the latest price is filled on this date",
+        "the latest gap is on this date",
         date=day(grid.dates[latest]),
     )
     if gaps[-1].any():
