@@ -319,9 +319,7 @@ class Portfolio(Market):
         due = jnp.asarray(self.terms.due(market, held))
         if not isinstance(feasible, Mandated):
             return jnp.where(due, feasible.project(weights, held), held)
-        left = self.terms.unspent(holding.plan)
-        if left is not None:
-            feasible = feasible.spending(left)
+        feasible = feasible.spending(self.terms.unspent(holding.plan))
         return feasible.project(weights, held, due)
 
     def trade(

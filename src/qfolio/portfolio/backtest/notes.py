@@ -13,6 +13,7 @@ from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.folder import AgentConfig
 from qfolio.portfolio.backtest.folds import Fold, fewest
 from qfolio.portfolio.backtest.replay import Entry, Replay
+from qfolio.portfolio.backtest.statistics.verdict import lost_everything
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.prices.findings import first_of, listing
 from qfolio.portfolio.task import Portfolio
@@ -133,12 +134,12 @@ def called(replay: Replay, entries: Mapping[str, Entry], own: Container[str]) ->
 
 def wiped_out(entries: Mapping[str, Entry]) -> list[str]:
     """A note on each strategy that lost everything."""
-    notes = []
-    for name, entry in entries.items():
-        lost = entry.simulation.ruined
-        seeds = "" if lost.all() else f" with {lost.sum()} of {lost.size} seeds"
-        notes += [f"{name} was wiped out{seeds}: it lost everything."] * bool(lost.any())
-    return notes
+    ruined = {name: entry.simulation.ruined for name, entry in entries.items()}
+    return [
+        f"{lost_everything(name, int(lost.sum()), lost.size)}."
+        for name, lost in ruined.items()
+        if lost.any()
+    ]
 
 
 @eqx.filter_jit

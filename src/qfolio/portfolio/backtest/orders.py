@@ -184,10 +184,7 @@ class _Account:
 
     def within_turnover(self, mandated: Feasible | None) -> Feasible | None:
         """What a mandate allows with the turnover that is left this year."""
-        left = self.terms.unspent(self.plan)
-        if left is None or not isinstance(mandated, Mandated):
-            return mandated
-        return mandated.spending(left)
+        return mandated and mandated.spending(self.terms.unspent(self.plan))
 
     def trade(self, row: int, held: Floats, order: Floats | None) -> Floats:
         """The weights after a row's trade; NaN if there is none."""

@@ -14,6 +14,7 @@ from qfolio.core.text import amount, listed, near, quote
 from qfolio.core.version import __version__
 from qfolio.portfolio import anchors
 from qfolio.portfolio.backtest.baselines import baseline
+from qfolio.portfolio.backtest.baselines.base import window_rows
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.folds import latest
 from qfolio.portfolio.backtest.own import Own
@@ -415,8 +416,8 @@ def lookback(followed: Policy | Untrained, dates: np.ndarray, month: int) -> tup
     task = followed.task
     if isinstance(followed, Rule) and followed.baseline.estimates:
         train = latest("", dates, followed.train, followed.expanding).train
-        months, least = followed.baseline.months, getattr(followed.baseline, "least", 0)
-        window = len(dates) if months is None else max(months * month, least) + 1
+        months, least = followed.baseline.months, followed.baseline.least
+        window = len(dates) if months is None else window_rows(months, least, month)
         found[followed.name] = min(window, train.stop - train.start)
     if any(baseline(name).estimates for name in anchors.baselines(task.anchor)):
         found["the agent's anchor"] = (anchors.MONTHS + 1) * month  # it decides once a month

@@ -95,9 +95,8 @@ def _allowed(
     task: Portfolio, row: jax.Array, held: jax.Array, spent: jax.Array
 ) -> tuple[Feasible, jax.Array]:
     """The weights that may be ordered at a row, and the nearest of them to those held."""
-    allowed, left = task.feasible_at(row), task.terms.unspent(task.terms.begin(held, spent))
-    if isinstance(allowed, Mandated) and left is not None:
-        allowed = allowed.spending(left)
+    left = task.terms.unspent(task.terms.begin(held, spent))
+    allowed = task.feasible_at(row).spending(left)
     return allowed, allowed.project(held, held)
 
 

@@ -101,8 +101,7 @@ class Rule(Untrained):
             if mandated.limits_risk:
                 last = jnp.array(len(table) - 1)
                 mandated = mandated.knowing(self.task.on(table).risk_at(last))
-            left = terms.unspent(terms.begin(held, spent))
-            mandated = mandated if left is None else mandated.spending(left)
+            mandated = mandated.spending(terms.unspent(terms.begin(held, spent)))
         open_to = holdable(tradable, mandated)
         history = History(table.dates, table.values, fold.train, open_to, cap, table.month)
         wanted = ask(self.name, self.baseline, history, held, mandated)

@@ -30,6 +30,10 @@ class Feasible(eqx.Module):
         """The largest sum of absolute weights of the assets."""
         return 1.0
 
+    def spending(self, turnover: Any) -> "Feasible":
+        """The set of orders with at most some turnover, if a mandate limits it; None: no limit."""
+        return self
+
     @abc.abstractmethod
     def project(
         self, wanted: Float[Array, " entry"], held: Float[Array, " entry"]
@@ -127,7 +131,8 @@ class Mandated(Feasible):
         )
 
     def spending(self, turnover: Any) -> "Mandated":
-        """The set of orders with at most some turnover."""
+        if turnover is None:
+            return self
         least = turnover.__array_namespace__().minimum(self.limits.turnover, turnover)
         return dataclasses.replace(self, limits=self.limits._replace(turnover=least))
 

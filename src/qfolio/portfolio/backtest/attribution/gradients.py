@@ -8,7 +8,6 @@ mean over midpoints, and each directional derivative takes one forward pass.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -96,7 +95,12 @@ def integrated_gradients(
 
 @eqx.filter_jit(donate="none")
 def integrated(
-    task: Portfolio, agent: Agent, members: PyTree, rows: Array, held: Array, spent: Any = 0.0
+    task: Portfolio,
+    agent: Agent,
+    members: PyTree,
+    rows: Array,
+    held: Array,
+    spent: Array | float = 0.0,
 ) -> tuple[
     Float[Array, "day channel asset"], Float[Array, "day asset channel"], Float[Array, "day asset"]
 ]:

@@ -16,7 +16,6 @@ latest row.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -132,7 +131,7 @@ def answer(
     row: Array,
     features: Array,
     held: Array,
-    spent: Any = 0.0,
+    spent: Array | float = 0.0,
 ) -> Float[Array, " entry"]:
     """The target weights at a row with the given features, the mean of all members."""
     asked = task.having(decides=jnp.ones_like(task.decides))  # on any day

@@ -37,7 +37,7 @@ class History(NamedTuple):
         """
         start = self.train.start or 0
         if months is not None:
-            start = max(start, len(self.prices) - 1 - max(months * self.month, least))
+            start = max(start, len(self.prices) - window_rows(months, least, self.month))
         return np.asarray(self.prices[start:][:, self.tradable])
 
     def returns(self, months: int | None = None, least: int = 0) -> Floats:
@@ -59,12 +59,15 @@ class Baseline(ABC):
             between. "row": at every row; None then lets the holding drift.
         estimates: Whether ``decide`` reads past prices. If not, it may hold any asset that is
             available at the decision, where assets come and go.
-        months: Latest months that it reads (default: the training window and all rows since).
+        months: Latest months whose returns it reads (default: the training window and all rows
+            since).
+        least: Number of returns that it reads at least, if there are so many.
     """
 
     calendar: ClassVar[Calendar] = "fold"
     estimates: ClassVar[bool] = True
     months: ClassVar[int | None] = None
+    least: ClassVar[int] = 0
 
     @abstractmethod
     def decide(self, history: History, held: Floats) -> Floats | None:
@@ -86,13 +89,9 @@ class Fitted(Baseline):
     If there is no solution, weights are equal, with a warning. The excess of a weight over the cap
     goes to the assets below the cap, in proportion to their weights. If the cap is too low for the
     assets to hold everything, all are at the cap and the rest is cash.
-
-    Attributes:
-        least: Number of returns that the window has at least, if there are so many.
     """
 
     calendar = "month"
-    least: ClassVar[int] = 0
 
     @abstractmethod
     def fit(self, returns: Floats, cap: float) -> Floats:
@@ -128,6 +127,14 @@ def baseline(name: str) -> Baseline:
     """
     made: Baseline = imported("baseline", name)()
     return made
+
+
+def window_rows(months: int, least: int, month: int) -> int:
+    """Rows of prices that give the returns of some latest months, and at least ``least`` returns.
+
+    month: rows in a month.
+    """
+    return max(months * month, least) + 1
 
 
 def equal_weights(history: History) -> Floats:

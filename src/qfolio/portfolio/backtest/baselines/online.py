@@ -26,7 +26,7 @@ ROWS = 5
 class Online(Baseline):
     """A rule that starts with equal weights and takes a step at every row."""
 
-    calendar, months = "row", 1
+    calendar, months, least = "row", 0, ROWS - 1
 
     @abstractmethod
     def step(self, target: Floats, prices: Floats) -> Floats:

@@ -85,9 +85,13 @@ def _ruin(name: str, strategy: StrategyAssessment, difference: Difference) -> st
     if not wiped_out(strategy):
         return f"{difference.reference} was wiped out, and {name} was not"
     deepest = strategy.measures["drawdown"].per_seed
-    lost = deepest.count(1)
-    seeds = "" if lost == len(deepest) else f" with {lost} of {len(deepest)} seeds"
-    return f"{name} was wiped out{seeds}: it lost everything"
+    return lost_everything(name, deepest.count(1), len(deepest))
+
+
+def lost_everything(name: str, lost: int, seeds: int) -> str:
+    """That a strategy lost everything, with how many of its seeds."""
+    some = "" if lost == seeds else f" with {lost} of {seeds} seeds"
+    return f"{name} was wiped out{some}: it lost everything"
 
 
 def _alike(one: Difference, other: Difference) -> bool:
