@@ -38,11 +38,15 @@ from qfolio.learning.targets import (
     smallest,
     td_target,
 )
+from qfolio.portfolio.following import begin, follow
 from qfolio.portfolio.synthetic.ar1 import Ar1
+from qfolio.portfolio.synthetic.leverage import Leverage
 from qfolio.portfolio.synthetic.merton import Merton
+from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.gymnasium import GymnasiumTask
 from qfolio.tasks.pendulum import Pendulum
 
+from planted import persistent
 from populations import assert_same, train_to
 
 VALUES, ROOTS = Scale(roots=False), Scale(roots=True)
@@ -326,6 +330,7 @@ def test_refuses_what_makes_no_sense(settings):
     [
         (Pendulum(torques=0), "those of Pendulum are continuous; use sac or ppo"),
         (Merton(), "those of Merton are continuous; give it a menu of .* or use sac or ppo"),
+        (Leverage(), "those of Leverage are continuous; use sac or ppo"),
         (GymnasiumTask("Pendulum-v1"), "those of Pendulum-v1 are continuous; use sac or ppo"),
     ],
 )
@@ -657,3 +662,31 @@ def test_priorities_are_part_of_what_is_saved(task, agent, tmp_path):
     again = read_tree(tmp_path / "state", fresh)
     assert again.replay.priorities.levels[-1].sum() == agent.num_envs
     assert_same(again, state)
+
+
+@pytest.mark.slow
+def test_on_signals_it_departs_from_the_anchor_only_where_that_pays_for_its_costs():
+    chosen = preset("fast", "portfolio", "dqn")
+    prices = persistent(rows=1500, market=0.01)
+
+    def departed(cost):
+        task = Portfolio.of(prices, **{**chosen.task, "cost": cost})
+        agent = chosen.build()
+        population = train_to(Population(task, agent, [0, 1, 2]), chosen.episodes)
+        start = begin(task, np.tile(np.append(0, np.full(6, 1 / 6)), (3, 1)))
+        first = int(task.first_decision)
+        targets, _ = follow(task, agent, population.weights(), first, start, 1200)
+        return abs(targets[..., 1:] - 1 / 6).sum(-1).mean(-1)
+
+    assert (departed(0.001) > 0.5).all()
+    # Values that leave out the price of the way back depart here, too.
+    assert (departed(0.01) < 0.15).all(), "no more than the band around the anchor"
+
+
+def test_what_the_way_back_to_the_anchor_costs_is_learned():
+    chosen = preset("fast", "portfolio", "dqn")
+    task = Portfolio.of(persistent(rows=500, market=0.01), **{**chosen.task, "cost": 0.02})
+    agent = chosen.build(bootstrap_heads=2, learning_starts=256, num_envs=8)
+    learned = train_to(Population(task, agent, [0]), 128).weights().networks
+    assert (learned.price > 0.1).all()
+    assert (learned.way_back > 0.1).all()

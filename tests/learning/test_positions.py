@@ -45,12 +45,14 @@ def test_tilts_by_hand():
 
 def test_an_order_is_worth_what_the_same_entry_of_a_menu_is():
     orders = jnp.array([[0.4, 0.4, 0.2], [0.0, 0.0, 0.0]])
-    learned = (jnp.array([1.0, 2.0]), jnp.array(0.1), jnp.array(5.0))
+    learned = (jnp.array([1.0, 2.0]), jnp.array(0.1), jnp.array(0.2), jnp.array(5.0))
     learn = lambda network: eqx.tree_at(  # noqa: E731
-        lambda n: (n.linear, n.price, n.value), network, learned
+        lambda n: (n.linear, n.price, n.way_back, n.value), network, learned
     )
     by_menu = learn(Values(view()))(view()._replace(choices=orders[None]))
-    assert by_menu[0, 0] == pytest.approx(5 + (0.15 * 2 - 0.15 * 2 - 0.3 * 0) - 0.1 * 0.2)
+    assert by_menu[0, 0] == pytest.approx(
+        5 + (0.15 * 2 - 0.15 * 2 - 0.3 * 0) - 0.1 * 0.2 - 0.2 * 0.6
+    )
     for i, order in enumerate(orders):
         found = OrderValue(learn(Values(view())))(
             (view(), jnp.append(1 - order.sum(), order)[None])
@@ -105,6 +107,7 @@ def test_active_rewards_are_those_over_the_anchors():
     ("changes", "message"),
     [
         ({"anchor": ""}, "set an anchor"),
+        ({"active": False, "tracking_aversion": 1.0}, "set active=true, or tracking_aversion=0"),
         ({"reward": "differential-sharpe"}, "depends on earlier ones"),
     ],
 )

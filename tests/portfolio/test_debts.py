@@ -17,10 +17,12 @@ from qfolio.core.training import begin
 from qfolio.experiments.presets import preset
 from qfolio.learning.networks import last_layer
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.market import RUIN
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.task import Portfolio
 
 from planted import planted
+from tables import price_table
 
 MANDATE = {
     "assets": {"cap": 0.5, "floor": -0.3},
@@ -125,3 +127,23 @@ def test_what_is_learned_sells_short_within_the_mandate() -> None:
     growth = {name: entry.simulation.growth.mean() for name, entry in entries.items()}
     assert growth["pathwise"] > growth["equal-weight"]
     assert backtest.assess(entries).bound is None  # constant weights with debts have none
+
+
+@pytest.mark.parametrize(("lag", "later"), [(1, 240.0), (2, 240.0), (2, 120.0)])
+def test_an_order_that_is_worth_nothing_while_it_waits_is_ruin(lag: int, later: float) -> None:
+    values = np.full((40, 1), 100.0)
+    values[21:] = 230.0  # a short position of the whole wealth cannot be paid back
+    values[21 + lag - (later == 120) :] = later
+    mandate = {"assets": {"floor": -1.0}, "cash": {"max": 2.0}, "exposure": {"gross": 1.0}}
+    task = Portfolio.of(price_table(values), window=5, horizon=5, lag=lag, mandate=mandate)
+    row, order = jnp.array(20), jnp.array([2.0, -1.0])
+    cash = task.hold(jnp.array([1.0, 0.0]))
+    reward, after = task.settle(row, row + 1, cash, order)
+    assert float(reward) == pytest.approx(np.log(RUIN), abs=1e-5)
+    np.testing.assert_array_equal(after.weights, [1, 0])
+    # It is worth nothing from the start of the wait on, too.
+    if later == 120:  # it is worth something again when it is executed
+        return
+    short = task.hold(order)
+    reward, after = task.settle(row, row + 1, short, jnp.array([1.0, 0.0]))
+    assert float(reward) == pytest.approx(np.log(RUIN), abs=1e-5)

@@ -238,15 +238,32 @@ def test_a_menu_of_signals_by_hand():
     start = Signalled(jnp.array([0.5, 0.5]), jnp.array([[1.0], [-1.0]]))
 
     def orders(held):
-        return [menu.weights(jnp.array(held), jnp.array(i), start) for i in range(3)]
+        return [menu.weights(jnp.asarray(held), jnp.array(i), start) for i in range(3)]
 
-    def on_the_way(held, first, second):
-        return 0.7 * np.array(held) + 0.3 * np.array([0, first, second]) / (first + second)
+    up, down = np.array([[0, np.exp(2), np.exp(-2)], [0, np.exp(-2), np.exp(2)]]) / (2 * np.cosh(2))
+    equal = np.array([0, 0.5, 0.5])
+    # Idle cash is invested at once.
+    np.testing.assert_allclose(orders([1.0, 0, 0]), [equal, up, down], atol=1e-6)
+    # The anchor's band reaches from 0.4 to 0.6; a tilt has none.
+    for held, anchored in (([0, 0.58, 0.42], [0, 0.58, 0.42]), ([0, 0.7, 0.3], [0, 0.67, 0.33])):
+        tilts = [0.7 * np.array(held) + 0.3 * tilt for tilt in (up, down)]
+        np.testing.assert_allclose(orders(held), [anchored, *tilts], atol=1e-6)
+    # Cash that the anchor holds is raised at once; the third asset cannot be traded.
+    start = Signalled(jnp.array([0.4, 0.4, 0.0]), jnp.array([[1.0], [-1.0], [9.0]]))
+    anchor, tilted = np.array([0.2, 0.4, 0.4, 0]), 0.8 * np.insert(up, 3, 0) + [0.2, 0, 0, 0]
+    expected = np.array([anchor, 0.7 * anchor + 0.3 * tilted])
+    np.testing.assert_allclose(orders([0, 0.5, 0.5, 0])[:2], expected, atol=1e-6)
 
-    for held in ([0, 0.6, 0.4], [1.0, 0, 0]):
-        targets = [(1, 1), (np.exp(2), np.exp(-2)), (np.exp(-2), np.exp(2))]
-        expected = [on_the_way(held, *target) for target in targets]
-        np.testing.assert_allclose(orders(held), np.array(expected), atol=1e-6)
+
+def test_what_all_assets_share_cancels_in_a_tilt():
+    anchor = jnp.array([0.5, 0.0, 0.3])
+    for shared in (-300.0, 0.0, 300.0):
+        signals = jnp.array([[1.0], [9.0], [-1.0]]) + shared
+        tilted = Menu.tilted(Signalled(anchor, signals), jnp.array([0.5]))
+        expected = np.array([0.5 * np.exp(0.5), 0, 0.3 * np.exp(-0.5)])
+        np.testing.assert_allclose(tilted[1:], 0.8 * expected / expected.sum(), rtol=1e-4)
+    empty = Menu.tilted(Signalled(jnp.zeros(3), jnp.ones((3, 1))), jnp.array([0.5]))
+    np.testing.assert_array_equal(empty, [1, 0, 0, 0])
 
 
 def signalling(**settings):
@@ -278,6 +295,8 @@ def test_a_view_shows_what_a_menu_of_signals_orders_within_the_cap():
     np.testing.assert_allclose(
         view.choices[3], task.target(jnp.array(100), task.hold(held), jnp.array(3))[1:], rtol=1e-6
     )
+    assert view.anchor is not None, "equal weights, where no anchor is set"
+    np.testing.assert_allclose(view.anchor, 1 / 3, rtol=1e-6)
     assert portfolio(menu="tilts:0.1").view(jnp.array(100), task.hold(held)).choices is None
 
 

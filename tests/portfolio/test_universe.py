@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -714,3 +715,24 @@ def test_members_that_cannot_be_read(tmp_path: Path, text: str, said: str) -> No
     (tmp_path / "members.csv").write_text(text)
     with pytest.raises(QfolioError, match=said):
         load(frame_of(30, 3), members=tmp_path / "members.csv")
+
+
+@pytest.mark.parametrize("short", [False, True])
+def test_what_a_delisting_costs_or_pays_earns_what_cash_does_without_an_order(short: bool) -> None:
+    """A short position that was settled is no loan, although cash was not ordered to pay it."""
+    frame = frame_of(40, 2)
+    frame.iloc[10:, 0] = np.nan
+    model = Itemized(cash_rate="0.03", borrow_fee="0.05", borrow_spread=0.05, cost=0.0)
+    prices = load(frame, ended="cash-out")
+    order = np.array([1.5, -0.5, 0.0] if short else [0.5, 0.5, 0.0])
+    decisions = np.full((39, 3), np.nan)
+    decisions[0] = order
+    known = Conditions.of(prices, model)
+    replay = partial(
+        simulate, prices.values, first=0, cost=model, lag=0, conditions=known, long_only=False
+    )
+    cash = np.full((39, 3), np.nan)
+    cash[0] = [1, 0, 0]
+    np.testing.assert_allclose(
+        replay(decisions=decisions).returns[10:], replay(decisions=cash).returns[10:], atol=1e-12
+    )

@@ -179,10 +179,11 @@ class DQN(Agent):
 
     def init(self, task: Task, key: PRNGKeyArray) -> DQNState:
         if not isinstance(task.actions, Discrete):
-            menu = "give it a menu of allocations (menu=tilts:0.1), or "
+            has_menu = any(field.name == "menu" for field in dataclasses.fields(task))
+            menu = "give it a menu of allocations (menu=tilts:0.1), or " if has_menu else ""
             raise QfolioError(
                 f"dqn chooses among numbered actions, but those of {task.name} are continuous; "
-                f"{menu if isinstance(task, ExogenousTask) else ''}use sac or ppo."
+                f"{menu}use sac or ppo."
             )
         state = task.reset(key)
         observation = task.observe(state)

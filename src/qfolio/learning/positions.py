@@ -26,25 +26,29 @@ relative to that of cash, so its floor is far above the rounding error of 1 less
 class Values(eqx.Module):
     """The value of the positions that each action orders or, without choices, of those held.
 
-    Q(s, a) = Σᵢ (bᵢ − anchorᵢ) θ·xᵢ − p Σᵢ |bᵢ − hᵢ| + v, where b are the weights that action a
-    orders, h those held, and x the latest features of an asset except the first, its return. As one
-    θ serves all actions, the value is one of the state after a decision (Powell 2011, section 4.6).
+    Q(s, a) = Σᵢ (bᵢ − anchorᵢ) θ·xᵢ − p Σᵢ |bᵢ − hᵢ| − q Σᵢ |bᵢ − anchorᵢ| + v, where b are the
+    weights that action a orders, h those held, and x the latest features of an asset except the
+    first, its return. p is the price of a trade, and q that of the way back to the anchor, without
+    which departures look cheaper than they are. As one θ serves all actions, the value is one of
+    the state after a decision (Powell 2011, section 4.6).
     """
 
     linear: Float[Array, " channel"]  # θ
     price: Float[Array, ""]  # p
+    way_back: Float[Array, ""]  # q
     value: Float[Array, ""]  # v
 
     def __init__(self, view: View) -> None:
         self.linear = jnp.zeros(view.features.shape[-1] - 1)
-        self.price, self.value = jnp.zeros(()), jnp.zeros(())
+        self.price, self.way_back, self.value = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
 
     def __call__(self, view: View) -> Float[Array, "batch action"]:
         held, signals = view.holding[..., None, :], view.features[..., -1, 1:]
         choices = held if view.choices is None else view.choices
         active = choices if view.anchor is None else choices - view.anchor[..., None, :]
         traded = jnp.abs(choices - held).sum(-1)
-        return self.value + (active @ signals) @ self.linear - self.price * traded
+        costs = self.price * traded + self.way_back * jnp.abs(active).sum(-1)
+        return self.value + (active @ signals) @ self.linear - costs
 
 
 class OrderValue(eqx.Module):

@@ -110,12 +110,17 @@ class CostModel(abc.ABC):
 
     def growth(self, weights: Any, relatives: Any, context: Context) -> Any:
         """Growth factors of each entry of a holding, of shape (..., N + 1), by its sign."""
-        owned = delisted(self.carry(relatives, context), relatives, context.listed)
-        owed = self.owe(relatives, context)
+        owned, owed = self.carry(relatives, context), self.owe(relatives, context)
+        cash = owned[..., :1]
+        owned = delisted(owned, relatives, context.listed, cash)
         if owed is None:
             return owned
-        owed = delisted(owed, relatives, context.listed)
+        owed = delisted(owed, relatives, context.listed, cash)
         return weights.__array_namespace__().where(weights < 0, owed, owned)
+
+    def worth(self, weights: Any, relatives: Any, context: Context) -> Any:
+        """What a holding is worth after a period, as a multiple of its worth before, (...)."""
+        return (weights * self.growth(weights, relatives, context)).sum(-1)
 
     def held(self, weights: Any, relatives: Any, context: Context) -> Any:
         """Weights after a holding period without a trade; assets delisted by then are cash."""
@@ -280,18 +285,21 @@ def grown(weights: Any, growth: Any) -> Any:
     return worth / worth.sum(-1, keepdims=True)
 
 
-def delisted(growth: Any, relatives: Any, listed: Any) -> Any:
+def delisted(growth: Any, relatives: Any, listed: Any, cash: Any) -> Any:
     """Growth factors in which a delisted asset is paid out, and its payout earns what cash earns.
+
+    The payout of a short position is taken from cash, so it costs what that would have earned.
 
     Args:
         growth: Growth factors of cash and of each asset, of shape (..., N + 1).
         relatives: New price over old price of each asset, of shape (..., N).
         listed: Whether each asset has a price at the end, of the same shape; None if all have one.
+        cash: Growth factor of cash that is owned, of shape (..., 1).
     """
     if listed is None:
         return growth
     xp = growth.__array_namespace__()
-    paid_out = relatives * growth[..., :1]
+    paid_out = relatives * cash
     return xp.concat([growth[..., :1], xp.where(listed > 0, growth[..., 1:], paid_out)], axis=-1)
 
 

@@ -200,12 +200,13 @@ class Market(ExogenousTask):
 
     def view(self, market: PyTree, holding: Holding) -> View:
         """The observation of a market from a holding."""
-        choices = None
+        choices, anchor = None, self.anchor_weights(market)
         if (menu := self._signal_menu) is not None:
             order = jax.vmap(self.target, (None, None, 0))
             choices = order(market, holding, jnp.arange(menu.actions.n))[:, 1:]
-        held = holding.weights[1:]
-        return View(self.features(market), held, self.anchor_weights(market), choices)
+            signalled = self.signalled(market)
+            anchor = None if signalled is None else signalled.anchor
+        return View(self.features(market), holding.weights[1:], anchor, choices)
 
     def observe(self, state: Position) -> View:
         return self.view(state.market, state.holding)
@@ -303,7 +304,11 @@ class Market(ExogenousTask):
         remainder, paid = costs.trade(before, after, at.trade)
         growth = remainder * (after * costs.growth(after, moved.earning, at.earning)).sum()
         if self._wealth_may_end:
-            growth = jnp.where(growth > RUIN, growth, RUIN)
+            # An order that is worth nothing is ruin, too: when it is executed, and at the next
+            # decision, where weights could not describe it.
+            before_trade = [costs.worth(w, moved.waiting, at.waiting) for w in (held, target)]
+            worths = jnp.stack([*before_trade, costs.worth(target, moved.coming, at.coming)])
+            growth = jnp.where((growth > RUIN) & (worths > 0).all(), growth, RUIN)
         return Trade(before, after, remainder, sum(paid.values()), growth)
 
     def planned(self, market: PyTree, plan: Plan | None) -> Plan | None:

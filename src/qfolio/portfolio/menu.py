@@ -11,12 +11,17 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import MenuActions
 from qfolio.core.mdp import Discrete
+from qfolio.learning.trading import Trading, ratio
 
 MOST = 2000
 """Largest number of allocations of a menu."""
 
 RATE = 0.3
 """Fraction of the distance to its target that an order of the menu "signals" trades."""
+
+BAND = 0.2
+"""How far a weight may drift from the anchor before its first order trades, in units of the equal
+weight: a fifth, as Daryanani (2008) found for portfolios that are rebalanced."""
 
 
 class Signalled(NamedTuple):
@@ -37,13 +42,14 @@ class Menu(eqx.Module):
       the holding moved into it;
     - "overweight:0.1": no order, all cash, equal weights, and for every asset equal weights with a
       tenth of the wealth moved into it;
-    - "signals:1": the fraction ``RATE`` of the way to the anchor, and, for every signal, of the
-      way to the anchor times exp(signal) or exp(−signal).
+    - "signals:1": the fraction ``RATE`` of the way to a band around the anchor, and, for
+      every signal, of the way to the anchor times exp(signal) or exp(−signal); each invests idle
+      cash at once.
     """
 
-    keep: Float[Array, " choice"]
-    target: Float[Array, "choice entry"]
-    tilts: Float[Array, "choice signal"] | None  # instead of targets
+    keep: Float[Array, " choice"] | None  # share of the holding
+    target: Float[Array, "choice entry"] | None
+    tilts: Float[Array, "choice signal"] | None  # instead of both
     actions: Discrete
 
     def __init__(self, text: str, limits: Float[Array, " asset"], signals: int = 0) -> None:
@@ -52,7 +58,7 @@ class Menu(eqx.Module):
         each = jnp.eye(assets + 1)[1:]
         open_to = jnp.append(0.0, limits > 0)
         cash, equal = jnp.eye(assets + 1)[:1], (open_to / open_to.sum())[None]
-        tilts = None
+        keep = target = tilts = None
         try:
             value = float(size)
         except ValueError:
@@ -80,8 +86,6 @@ class Menu(eqx.Module):
                 )
             one = jnp.eye(signals)
             tilts = value * jnp.concatenate([jnp.zeros((1, signals)), one, -one])
-            target = jnp.zeros((len(tilts), assets + 1))
-            keep = jnp.full(len(tilts), 1 - RATE)
             self.actions = MenuActions(len(tilts), pooled=len(tilts), each=0)
         else:
             raise QfolioError(
@@ -97,16 +101,24 @@ class Menu(eqx.Module):
         signalled: Signalled | None = None,
     ) -> Float[Array, " entry"]:
         """The allocation of a choice, given the weights held; only signals need ``signalled``."""
-        target = self.target[choice]
-        if self.tilts is not None:
-            assert signalled is not None
-            target = self.tilted(signalled, self.tilts[choice])
-        return self.keep[choice] * held + (1 - self.keep[choice]) * target
+        if self.tilts is None:
+            assert self.keep is not None
+            assert self.target is not None
+            return self.keep[choice] * held + (1 - self.keep[choice]) * self.target[choice]
+        assert signalled is not None
+        target = self.tilted(signalled, self.tilts[choice])
+        # Without a band, an agent that stays at the anchor pays for trades at every row.
+        band = jnp.where(choice == 0, BAND, 0.0)
+        trading = Trading(Trading.start(RATE).rate, jnp.log(band))
+        return trading(held[1:], target, signalled.anchor)
 
     @staticmethod
     def tilted(signalled: Signalled, tilt: Float[Array, " signal"]) -> Float[Array, " entry"]:
         """The anchor times exp(signals·tilt), with the anchor's sum."""
+        anchor = signalled.anchor
         # The other order would give all choices' weights by asset, to be transposed.
-        weights = signalled.anchor * jnp.exp(tilt @ signalled.signals.T)
-        weights = weights * signalled.anchor.sum() / jnp.maximum(weights.sum(), 1e-9)
-        return simplex.with_rest(weights)
+        logits = jnp.where(anchor > 0, tilt @ signalled.signals.T, -jnp.inf)
+        # What all assets share cancels, however large it is.
+        largest = jnp.where(anchor.any(), logits.max(), 0.0)
+        weights = anchor * jnp.exp(logits - largest)
+        return simplex.with_rest(weights * ratio(anchor.sum(), weights.sum()))

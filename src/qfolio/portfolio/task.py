@@ -109,7 +109,7 @@ class Portfolio(Market):
         if "mandate" in settings:
             settings["mandate"] = mandate_text(settings["mandate"], prices.assets)
         task = Portfolio.blank(len(prices.assets), len(prices.feature_names), **settings)
-        return task.on_all(prices)
+        return task.on_rows(prices)
 
     @staticmethod
     def blank(assets: int, features: int, **settings: Any) -> "Portfolio":
@@ -136,10 +136,13 @@ class Portfolio(Market):
             **settings,
         )
 
-    def on_all(self, prices: Prices) -> "Portfolio":
-        """The same task on all rows of a table, with the scale of its observations."""
-        first = ~np.isnan(prices.values[0]) if prices.tradable is None else None
-        return self.on(prices).part(0, len(prices) - 1, first)
+    def on_rows(self, prices: Prices, first: int = 0) -> "Portfolio":
+        """The same task on a table's rows from ``first`` on, with the scale of its observations.
+
+        Signals and anchors look back on the rows before.
+        """
+        there = ~np.isnan(prices.values[first]) if prices.tradable is None else None
+        return self.on(prices).part(first, len(prices) - 1, there)
 
     def on(self, prices: Prices) -> "Portfolio":
         """The same task on another table, otherwise unchanged."""
@@ -212,6 +215,11 @@ class Portfolio(Market):
             raise QfolioError(
                 "active=true measures rewards in excess of an anchor's; set an anchor, such as "
                 "anchor=equal-weight."
+            )
+        if self.tracking_aversion and not self.active:
+            raise QfolioError(
+                "tracking_aversion penalizes rewards in excess of an anchor's; set active=true, or "
+                "tracking_aversion=0."
             )
         if self.active and self.path_dependent:
             raise QfolioError(

@@ -20,7 +20,8 @@ from qfolio.portfolio.task import Portfolio
 from tables import days, price_table, random_walk
 from tiny import PATHWISE
 
-ACTIVE = {**PATHWISE.task, "anchor": "equal-weight", "active": True}  # as in PPO's preset
+# As in PPO's preset.
+ACTIVE = {**PATHWISE.task, "anchor": "equal-weight", "active": True, "tracking_aversion": 10.0}
 AGENTS = {"pathwise": PATHWISE._replace(task=ACTIVE)}
 NAMES = ("cash", "A", "B", "C")
 DAYS = days(160).astype(str)

@@ -57,9 +57,9 @@ class Growth:
         relatives = self.prices[1:] / self.prices[:-1]
         context = self.conditions.holding(start + self.first, start + self.first + 1)
         found = self.costs.carry(relatives, context), self.costs.owe(relatives, context)
-        ones = np.ones((1, relatives.shape[1] + 1))
+        ones, cash = np.ones((1, relatives.shape[1] + 1)), found[0][..., :1]
         return [
-            np.cumprod(np.concatenate([ones, delisted(x, relatives, context.listed)]), axis=0)
+            np.cumprod(np.concatenate([ones, delisted(x, relatives, context.listed, cash)]), axis=0)
             for x in found
             if x is not None
         ]

@@ -129,7 +129,7 @@ class Replay:
         """
         context = self._conditions.holding(self.rows, self.rows + 1)
         growth = np.asarray(self.task.costs.carry(self.relatives, context))
-        growth = np.array(delisted(growth, self.relatives, context.listed))
+        growth = np.array(delisted(growth, self.relatives, context.listed, growth[:, :1]))
         unpriced = np.isnan(self.prices.values[self.rows])
         growth[:, 1:] = np.where(unpriced, growth[:, :1], growth[:, 1:])
         return growth

@@ -29,7 +29,9 @@ class Untrained(abc.ABC):
 
     def __init__(self, name: str, assets: tuple[str, ...], task: Portfolio, cap: float) -> None:
         self.name, self.assets, self.cap = name, assets, cap
-        self.task = dataclasses.replace(task, signals="", anchor="", menu="", active=False)
+        self.task = dataclasses.replace(
+            task, signals="", anchor="", menu="", active=False, tracking_aversion=0.0
+        )
 
     @property
     def costs(self) -> CostModel:

@@ -51,7 +51,8 @@ class SyntheticMarket(Market, Synthetic):
     def optimum(self) -> FollowedOptimum:
         # The best policy returns weights, even if agents choose from a menu.
         task: Any = self  # to the type checker, the abstract menu is not a field
-        return FollowedOptimum(dataclasses.replace(task, menu=""), self.best())
+        weights = dataclasses.replace(task, menu="") if self.menu else task
+        return FollowedOptimum(weights, self.best())
 
 
 class OneAsset(SyntheticMarket):

@@ -49,9 +49,9 @@ class Leverage(Scenarios):
     cash_rate: float = constant(0.02)  # rate that cash earns, per year
     borrow_spread: float = constant(0.03)  # rate of a loan above it, per year
     risk_aversion: float = number(2.0)  # relative risk aversion; 1: log growth
-    menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(100)  # quarters of an episode
 
+    menu = ""
     reward = "crra"
     dt = 0.25
     drift = (0.10, 0.08, 0.02)  # per year, like the volatilities
