@@ -106,3 +106,17 @@ def test_what_cannot_be_traded_goes_to_the_others():
     sparse = Portfolio.of(table(), window=1, horizon=10, anchor="momentum")
     held = np.asarray(sparse.anchor_weights(jnp.array(300)))
     assert held.min() == pytest.approx(LEAST / 4)  # not 0: it may be traded
+
+
+def test_a_delisted_asset_has_no_weight_in_a_column():
+    weights = np.tile([0.25] * 4, (ROWS, 1))
+    weights[200:] = [1 / 3, 1 / 3, 1 / 3, 0.25]  # its last number remains
+    listed = np.ones(weights.shape, bool)
+    listed[200:, 3] = False
+    prices = price_table(
+        table().values, features=weights[..., None], feature_names=("weight",), listed=listed
+    )
+    found = anchors.path("feature:weight", prices)
+    np.testing.assert_array_equal(found, np.where(listed, weights, 0))
+    alone = anchors.path(prices.assets[3], prices)
+    np.testing.assert_array_equal(alone, np.where(listed, [0, 0, 0, 1], 0))

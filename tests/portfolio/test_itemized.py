@@ -399,3 +399,22 @@ def test_fees_that_exceed_the_wealth_wipe_an_account_out() -> None:
     assert replayed.returns.tolist() == [-1, *[0] * (ROWS - 2)]
     assert replayed.cost[0] == pytest.approx(1, abs=1e-5)
     assert replayed.cost[1:].max() == 0
+
+
+@pytest.mark.parametrize("power", [0.5, 1.5, 2.0])
+def test_an_asset_without_a_price_has_no_impact(power: float) -> None:
+    model = Itemized(impact=1, impact_power=power, cost=0.0)
+    values = {"volume": [1e4, 0.0], "price": [5.0, 0.0], "volatility": [0.02, 0.02]}
+    before, after = np.array([1.0, 0.0, 0.0]), np.array([0.5, 0.5, 0.0])
+    exact = model.trade(
+        before, after, Context(columns={name: np.array(x) for name, x in values.items()})
+    )[0]
+    context = Context(columns={name: jnp.asarray(x) for name, x in values.items()})
+
+    def traded(after: jax.Array) -> jax.Array:
+        return model.trade(jnp.asarray(before, jnp.float32), after, context)[0]
+
+    value, slope = jax.value_and_grad(traded)(jnp.asarray(after, jnp.float32))
+    assert float(value) == pytest.approx(float(exact), abs=1e-6)
+    assert 0 < exact < 1
+    assert jnp.isfinite(slope).all()

@@ -139,9 +139,9 @@ def test_it_goes_on_from_where_it_was(policy):
     assert updated.updates == 1
     assert updated.rows == policy.rows
     np.testing.assert_array_equal(updated.task.scale, policy.task.scale)
-    assert int(updated.task.first_decision) == WINDOW
-    logs = np.diff(np.log(table().values), axis=0)[-59:]
-    np.testing.assert_allclose(updated.task.log_relatives[1:], logs, atol=1e-6)
+    first = len(table()) - policy.rows
+    assert int(updated.task.first_decision) == first + WINDOW
+    assert int(updated.task.last_decision) == len(table()) - 3
     if isinstance(policy.agent, DQN):
         # 20 steps are learned from; 9 warm up the memory, and the rest of that episode is learned.
         steps = updated.learner.optimizer.count - before.optimizer.count
@@ -173,6 +173,8 @@ def test_an_update_of_an_agent_that_weighs_evidence_learns_anew(episodes):
     )
     assert (one.learner.optimizer.count == 12).all()
     updated = [each.update(table(), episodes) for each in (one, other)]
+    learned_from = updated[0].task.extra[len(table()) - one.rows :]
+    assert np.isfinite(learned_from).all(), "signals look back on the rows before"
     assert (updated[0].learner.optimizer.count == (episodes or 12)).all()
     for x, y in zip(*(leaves(each.learner) for each in updated), strict=True):
         np.testing.assert_array_equal(x, y)

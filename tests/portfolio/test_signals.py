@@ -392,3 +392,24 @@ class Framed(Tomorrow):
 
 def test_a_signal_may_be_a_data_frame():
     assert np.isfinite(signals.compute([Framed(rows=5)], random_walk(60, 4))[5:]).all()
+
+
+def test_a_column_about_the_whole_market_stays_so_when_assets_come_and_go():
+    values, there = random_walk(60), np.ones((60, 3), bool)
+    there[:20, 1] = there[40:, 2] = False
+    level = np.linspace(10, 30, 60)[:, None]
+    column = np.broadcast_to(level, values.shape).copy()
+    column[:20, 1] = np.nan  # not listed yet
+    column[40:, 2] = column[40, 2]  # delisted: its last number remains
+    compute = lambda rows: signals.compute(  # noqa: E731
+        signals.parse("feature:vix"), values[:rows], columns={"vix": column[:rows]},
+        tradable=there[:rows],
+    )[..., 0]  # fmt: skip
+    for rows in (20, 40, 60):
+        np.testing.assert_array_equal(compute(rows), np.broadcast_to(level[:rows], (rows, 3)))
+    alone = np.where([True, False, False], column, np.nan)
+    found = signals.compute(signals.parse("feature:vix"), values, columns={"vix": alone})
+    np.testing.assert_array_equal(found[:, 0, 0], 0)  # one asset's own number is not the market's
+    assert np.isnan(found[:, 1:]).all()
+    column[50, 0] += 1
+    np.testing.assert_array_equal(compute(60)[50], [1, -1, np.nan])  # ranked if two differ

@@ -60,8 +60,9 @@ class Options(Reading):
             rows, or drift:0.05 to trade when a weight is more than 0.05 from its target (default:
             at every row; baselines keep their own calendars).
         signals: Signals that agents observe beside returns, separated by commas, each with its
-            lookback and the latest rows that it skips, in rows (momentum:252-21) or as times
-            (momentum:1y-1m), or your own as module:Name (default: the preset's).
+            lookback and the latest rows that it skips (drift and volatility-ratio: that it
+            measures), in rows (momentum:252-21) or as times (momentum:1y-1m), or your own as
+            module:Name (default: the preset's).
         strategy: Strategies of your own, each a CSV of target weights (date, and a column for
             each asset), of orders in shares (date, asset, shares), of returns (date, return) or
             of an index (date, level); may be repeated.

@@ -45,7 +45,7 @@ def path(anchor: str, prices: Prices, buyable: Bools | None = None) -> Floats:
     or if a column's weights are not at least 0, with a sum of at most 1.
     """
     if anchor in prices.assets:
-        return np.where(np.isnan(prices.values), 0.0, np.array(prices.assets) == anchor)
+        return np.where(np.isnan(prices.known), 0.0, np.array(prices.assets) == anchor)
     each = [
         _column(name.removeprefix(COLUMN), prices)
         if name.startswith(COLUMN)
@@ -125,7 +125,9 @@ def _column(name: str, prices: Prices) -> Floats:
             f"{COLUMN}{name} names a column of weights, but the table has no column {name}; give "
             "it with --features, with a weight for each asset and date."
         )
-    weights = np.nan_to_num(prices.features[..., prices.feature_names.index(name)])
+    column = prices.features[..., prices.feature_names.index(name)]
+    # A delisted asset keeps its last number.
+    weights = np.nan_to_num(np.where(np.isnan(prices.known), 0.0, column))
     if weights.min() < 0 or weights.sum(-1).max() > 1 + 1e-6:
         raise QfolioError(
             f"The weights in the column {name} must be at least 0 and add up to at most 1 at each "

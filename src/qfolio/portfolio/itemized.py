@@ -191,10 +191,11 @@ class _Rates:
         self.money = self.money[..., None]
         if model.impact > 0:
             volume = known(model.volume) * context.columns["price"]
-            # Before an asset's first price both are 0.
-            share = self.money / xp.maximum(xp.asarray(volume, dtype=dtype), TINY)
+            there = volume > 0  # not before an asset's first price
+            share = self.money / xp.where(there, xp.asarray(volume, dtype=dtype), 1.0)
             volatility = context.columns["volatility"]
-            self.impact = model.impact * volatility * share**model.impact_power
+            impact = model.impact * volatility * share**model.impact_power
+            self.impact = xp.where(there, impact, 0.0)
 
     def paid(self, change: Any) -> tuple[dict[str, Any], Any]:
         """Shares of wealth paid, by kind of cost, and the derivative of their sum by the change."""

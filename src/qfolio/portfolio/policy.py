@@ -187,8 +187,8 @@ class Policy:
                 f"The prices end on {day(table.dates[-1])}, but the policy has already learned "
                 f"from those up to {day(self.learned)}; give newer prices, or leave out the update."
             )
-        table = table.between(max(0, len(table) - self.rows), None)
-        task = self._moved(table)
+        task = self.task.on_rows(table, max(0, len(table) - self.rows))
+        task = task.having(center=self.task.center, scale=self.task.scale)
         rollouts = self.agent.relearned(self.learner)
         agent = self.agent if rollouts else _slowed(self.agent)
         draws = [np.random.SeedSequence((i, self.updates + 1)) for i in range(self.seeds)]
@@ -338,10 +338,6 @@ class Policy:
     def open(cls, folder: Path | str) -> "Policy":
         """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
         return cls(**policy_folder.read(path_of("folder", folder)))
-
-    def _moved(self, table: Prices) -> Portfolio:
-        """The task on all rows of another table, with the scale of the old one."""
-        return self.task.on_all(table).having(center=self.task.center, scale=self.task.scale)
 
 
 def _slowed(agent: Agent) -> Agent:

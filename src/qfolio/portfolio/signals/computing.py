@@ -42,15 +42,10 @@ def compute(
         else _checked(signal, prices)
         for signal in signals
     ]  # fmt: skip
-    shared = [_is_shared(signal, x) for signal, x in zip(signals, values, strict=True)]
-    if tradable is not None:
-        values = [
-            x if same else np.where(tradable, x, np.nan)
-            for x, same in zip(values, shared, strict=True)
-        ]
+    there = np.ones(prices.shape, bool) if tradable is None else tradable
     found = [
-        _scaled(x, same, s.scale or scale)
-        for s, x, same in zip(signals, values, shared, strict=True)
+        _scaled(signal, x, there, there & ~np.isnan(prices), signal.scale or scale)
+        for signal, x in zip(signals, values, strict=True)
     ]
     # On a monthly table, returns over a day, a week and a month are one signal, not three.
     for place, signal in enumerate(signals):
@@ -59,12 +54,19 @@ def compute(
     return np.stack(found, -1) if found else np.zeros((*prices.shape, 0))
 
 
-def _is_shared(signal: Signal, values: Floats) -> bool:
-    """Whether all assets have the same number, as in a column about the whole market."""
-    own = isinstance(signal, Column) and np.array_equal(
-        values, np.broadcast_to(values[:, :1], values.shape), equal_nan=True
-    )
-    return signal.shared or own
+def _market_wide(values: Floats, there: Bools) -> Floats | None:
+    """The number of each row that all assets which are there share, (row, 1); None if some do not.
+
+    A delisted asset keeps its last number, and does not count.
+    """
+    known = np.isfinite(values) & there
+    if (known.any(1, keepdims=True) & there & ~known).any():
+        return None
+    high = np.max(values, 1, keepdims=True, initial=-np.inf, where=known)
+    low = np.min(values, 1, keepdims=True, initial=np.inf, where=known)
+    if (low < high).any():
+        return None
+    return np.where(low == high, high, np.nan)
 
 
 def _column(name: str, columns: Mapping[str, Floats]) -> Floats:
@@ -126,16 +128,22 @@ def _telling(found: Floats, prices: Floats) -> NDArray[np.int64]:
     return np.unique(np.concatenate(each))
 
 
-def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
+def _scaled(signal: Signal, values: Floats, there: Bools, priced: Bools, scale: str) -> Floats:
+    """Scaled across the assets that are there; what all those with a price share stays as it is."""
     values = np.where(np.isfinite(values), values, np.nan)  # one alone would silence all
-    if not shared and scale == "rank":
+    if signal.shared:
+        return values
+    if isinstance(signal, Column) and (common := _market_wide(values, priced)) is not None:
+        return np.broadcast_to(common, values.shape)
+    values = np.where(there, values, np.nan)
+    if scale == "rank":
         import pandas as pd
 
         ranks = pd.DataFrame(np.round(values / _unit(values))).rank(axis=1).to_numpy()
         count = (~np.isnan(values)).sum(1, keepdims=True)
         ranked = 2 * (ranks - 1) / np.maximum(count - 1, 1) - 1
         return np.where(count > 1, ranked, 0 * values)  # one alone has no rank
-    elif not shared and scale in ("z-score", "centered"):
+    if scale in ("z-score", "centered"):
         known, unit = ~np.isnan(values), _unit(values)
         count = np.maximum(known.sum(1, keepdims=True), 1)
         values = values - np.nansum(values, 1, keepdims=True) / count

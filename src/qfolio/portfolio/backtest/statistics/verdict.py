@@ -181,11 +181,11 @@ def shown(key: Measured, contrast: Contrast) -> tuple[float, float, float]:
 def telling(value: float, digits: int) -> int:
     """The number of decimals, at least ``digits``, that keeps a small number from rounding to 0.
 
-    One that five decimals do not show is taken for rounding, such as that of a file.
+    One that four decimals do not show is taken for rounding, such as that of a file.
     """
     if value == 0 or not math.isfinite(value):
         return digits
-    return next((d for d in range(digits, 6) if round(value, d)), digits)
+    return next((d for d in range(digits, 5) if round(value, d)), digits)
 
 
 def _numbers(key: Measured, contrast: Contrast, p: str) -> str:
