@@ -23,6 +23,9 @@ BAND = 0.2
 """How far a weight may drift from the anchor before its first order trades, in units of the equal
 weight: a fifth, as Daryanani (2008) found for portfolios that are rebalanced."""
 
+LARGEST = 30.0
+"""Tilts are cut here, where one asset has nearly all of the weight, so that exp is finite."""
+
 
 class Signalled(NamedTuple):
     """The anchor that a menu of signals tilts, and the signals."""
@@ -106,19 +109,23 @@ class Menu(eqx.Module):
             assert self.target is not None
             return self.keep[choice] * held + (1 - self.keep[choice]) * self.target[choice]
         assert signalled is not None
+        assets, anchor = held[1:], signalled.anchor
         target = self.tilted(signalled, self.tilts[choice])
+        # What ``Trading`` without a band orders; under a vmap over choices, few numbers for all.
+        idle = anchor.sum() - assets.sum()
+        kept = (1 - RATE) * (1 + ratio(jnp.minimum(idle, 0.0), assets.sum()))
+        bought = RATE + (1 - RATE) * ratio(jnp.maximum(idle, 0.0), anchor.sum())
+        towards = simplex.with_rest(kept * assets + bought * target[1:])
         # Without a band, an agent that stays at the anchor pays for trades at every row.
-        band = jnp.where(choice == 0, BAND, 0.0)
-        trading = Trading(Trading.start(RATE).rate, jnp.log(band))
-        return trading(held[1:], target, signalled.anchor)
+        trading = Trading(Trading.start(RATE).rate, jnp.log(jnp.array(BAND)))
+        return jnp.where(choice == 0, trading(assets, simplex.with_rest(anchor), anchor), towards)
 
     @staticmethod
     def tilted(signalled: Signalled, tilt: Float[Array, " signal"]) -> Float[Array, " entry"]:
         """The anchor times exp(signals·tilt), with the anchor's sum."""
-        anchor = signalled.anchor
-        # The other order would give all choices' weights by asset, to be transposed.
-        logits = jnp.where(anchor > 0, tilt @ signalled.signals.T, -jnp.inf)
+        anchor, signals = signalled.anchor, signalled.signals
         # What all assets share cancels, however large it is.
-        largest = jnp.where(anchor.any(), logits.max(), 0.0)
-        weights = anchor * jnp.exp(logits - largest)
+        signals = signals - ratio(anchor @ signals, anchor.sum())
+        # The other order would give all choices' weights by asset, to be transposed.
+        weights = anchor * jnp.exp(jnp.clip(tilt @ signals.T, -LARGEST, LARGEST))
         return simplex.with_rest(weights * ratio(anchor.sum(), weights.sum()))
