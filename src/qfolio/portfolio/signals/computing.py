@@ -43,8 +43,9 @@ def compute(
         for signal in signals
     ]  # fmt: skip
     there = np.ones(prices.shape, bool) if tradable is None else tradable
+    priced = there & ~np.isnan(prices)
     found = [
-        _scaled(signal, x, there, there & ~np.isnan(prices), signal.scale or scale)
+        _scaled(signal, x, there, priced, signal.scale or scale)
         for signal, x in zip(signals, values, strict=True)
     ]
     # On a monthly table, returns over a day, a week and a month are one signal, not three.
