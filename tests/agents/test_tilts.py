@@ -39,13 +39,13 @@ TASK: dict[str, Any] = {
 }
 
 
-def tilt(linear, interaction=None, rate=0.0, band=-20.0, cap=1.0):
+def tilt(linear, interaction=None, rate=0.0, band=-20.0, cap=1.0, speed=1.0):
     count = len(linear)
     square = np.zeros((count, count)) if interaction is None else interaction
     resting = Trading(jnp.asarray(rate, float), jnp.asarray(band, float))
     trading = jax.tree.map(lambda x: x[None], resting)
     one = Tilt(jnp.asarray([linear], float), jnp.asarray([square], float), None, trading, resting)
-    return TiltPolicy(one, jnp.array(1.0), jnp.array(0.0), Simplex(3, cap))
+    return TiltPolicy(one, jnp.array(1.0), jnp.array(0.0), jnp.array(speed), Simplex(3, cap))
 
 
 def view(held, features=((0.0,), (0.0,), (0.0,)), anchor=(0.25, 0.25, 0.5)):
@@ -145,7 +145,7 @@ def trained(*tables, rounds=40, signals=TASK["signals"], **settings):
 def test_stays_at_the_anchor_where_prices_hold_nothing(network):
     states = trained(*(random_walk(1500, 8, seed) for seed in range(3)), network=network)
     assert states.evidence.steps.min() > 0
-    at_anchor = states.policy.share == 0
+    at_anchor = (states.policy.share == 0) & (states.policy.speed == 0)
     if states.policy.members.deep is not None:
         assert states.evidence_of_depth.steps.min() > 0
         at_anchor &= states.policy.depth == 0
@@ -229,9 +229,9 @@ def test_a_network_without_evidence_is_not_followed():
     one = Tilt(members.linear, members.interaction, Deep(network, fast), members.trading,
                members.resting)  # fmt: skip
     seen = view([0.2, 0.3, 0.5], [[0.3], [0.0], [-0.3]])
-    without = TiltPolicy(one, linear.share, jnp.array(0.0), linear.actions)
+    without = TiltPolicy(one, linear.share, jnp.array(0.0), linear.speed, linear.actions)
     np.testing.assert_array_equal(without(seen), linear(seen))
-    whole = TiltPolicy(one, linear.share, jnp.array(1.0), linear.actions)
+    whole = TiltPolicy(one, linear.share, jnp.array(1.0), linear.speed, linear.actions)
     np.testing.assert_allclose(whole.trading.described["rate"], 0.9, rtol=1e-5)
     assert np.abs(whole.target(seen) - linear.target(seen)).max() > 1e-2
 
@@ -240,8 +240,17 @@ def test_a_network_without_evidence_is_not_followed():
 def test_trades_at_the_speed_of_the_anchor_without_evidence_and_of_the_scores_with_it(share, rate):
     members = tilt([1.0], rate=0.0).members  # a rate of one half
     members = Tilt(members.linear, members.interaction, None, members.trading, Trading.start(0.1))
-    policy = TiltPolicy(members, jnp.array(share), jnp.array(0.0), Simplex(3))
+    policy = TiltPolicy(members, jnp.array(share), jnp.array(0.0), jnp.array(1.0), Simplex(3))
     np.testing.assert_allclose(policy.trading.described["rate"], rate, rtol=1e-5)
+
+
+def test_without_evidence_for_another_speed_the_anchor_is_kept_in_a_band_of_a_fifth():
+    policy = tilt([0.0], speed=0.0)
+    policy = TiltPolicy(policy.members, jnp.array(0.0), policy.depth, policy.speed, Simplex(3))
+    near = np.array([0, 0.3, 0.2, 0.5], np.float32)  # within a fifteenth of the anchor
+    np.testing.assert_array_equal(policy(view(near[1:])), near)
+    order = policy(view([0.45, 0.15, 0.4]))
+    np.testing.assert_allclose(order[1], 0.45 - 0.3 * (0.2 - 0.2 / 3), rtol=1e-5)
 
 
 @pytest.mark.parametrize("network", ["linear", "hidden"])
@@ -250,7 +259,8 @@ def test_the_anchor_is_rebalanced_faster_where_losers_recover(network):
     fading = lfilter([1], [1, -0.8], noise, axis=0)  # forgets a fifth a day
     go_on, revert = np.exp(np.cumsum(fading / 2, 0)), np.exp(fading)
     states = trained(go_on, revert, network=network)
-    slow, fast = states.policy.members.resting.described["rate"]
+    assert states.evidence_of_speed.t.min() > 3
+    slow, fast = jax.vmap(lambda policy: policy.resting.described["rate"])(states.policy)
     assert slow < 0.15
     assert fast > 0.6
 

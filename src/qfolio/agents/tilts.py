@@ -7,9 +7,10 @@ net utility through whole paths, as in ``pathwise.py``.
 
 Several members learn side by side, each without some blocks of the data. What a member earns over
 the anchor in the blocks that it has not seen is the evidence: the policy, the mean of the members,
-is shrunk to the anchor by it, after James & Stein (1961), and stays there without it, rebalanced at
-a speed of the anchor's own. A network learns on top of this policy and is followed as far as there
-is evidence that it earns more. docs/algorithms/tilts.md lists formulas and their sources.
+is shrunk to the anchor by it, after James & Stein (1961), and stays there without it. The anchor is
+kept in a band, or rebalanced at a learned speed as far as there is evidence that it earns more. A
+network learns on top of this policy and is followed likewise. docs/algorithms/tilts.md lists
+formulas and their sources.
 """
 
 import equinox as eqx
@@ -27,7 +28,7 @@ from qfolio.core.mdp import Box, Discrete, ExogenousTask, Metrics, Simplex, Task
 from qfolio.learning import optimizer
 from qfolio.learning.evidence import Evidence, EvidenceConfig, blocks_of, left_out
 from qfolio.learning.scores import NETWORKS, Attention, Hidden
-from qfolio.learning.trading import Trading, ratio
+from qfolio.learning.trading import BAND, RATE, Trading, ratio
 
 LARGEST = 3.0
 """Inputs are clipped to ± this many standard deviations of the training data."""
@@ -93,6 +94,7 @@ class TiltPolicy(eqx.Module):
     members: Tilt
     share: Float[Array, ""]  # of the linear scores that the evidence leaves
     depth: Float[Array, ""]  # share of what a network adds that its evidence leaves
+    speed: Float[Array, ""]  # share of the anchor's learned speed that its evidence leaves
     actions: Simplex | Box
 
     def __call__(self, view: View) -> Float[Array, "*batch entry"]:
@@ -111,9 +113,14 @@ class TiltPolicy(eqx.Module):
     def trading(self) -> Trading:
         """The anchor's, moved by the share towards the linear policy's, then by the depth towards
         the network's."""
-        found = self.members.resting.towards(self.members.trading.mean, self.share)
+        found = self.resting.towards(self.members.trading.mean, self.share)
         deep = self.members.deep
         return found if deep is None else found.towards(deep.trading.mean, self.depth)
+
+    @property
+    def resting(self) -> Trading:
+        """The anchor's: a band, moved by the speed towards what was learned for it."""
+        return Trading.start(RATE, BAND).towards(self.members.resting, self.speed)
 
 
 def tilted(
@@ -176,6 +183,7 @@ class TiltsState(eqx.Module):
     optimizer: optimizer.Optimizer
     evidence: Evidence
     evidence_of_depth: Evidence  # that a network earns more than the linear policy
+    evidence_of_speed: Evidence  # that the anchor earns more at its learned speed than in a band
 
 
 class Tilts(Onlooker):
@@ -230,7 +238,7 @@ class Tilts(Onlooker):
 
         linear = jnp.zeros((self.members, channels))
         square = jnp.zeros((self.members, channels, channels))
-        resting = Trading.start(0.3)
+        resting = Trading.start()
         trading = jax.tree.map(lambda x: jnp.full(self.members, x), resting)
         nothing, deep, evidence = jnp.array(0.0), None, Evidence.none(self.blocks)
         if self.network in NETWORKS:
@@ -238,13 +246,14 @@ class Tilts(Onlooker):
             networks = jax.vmap(make)(jax.random.split(key, self.members))
             deep = Deep(networks, trading)
         members = Tilt(linear, square, deep, trading, resting)
-        policy = TiltPolicy(members, nothing, nothing, actions)
-        return TiltsState(policy, optimizer.begin(members), evidence, evidence)
+        policy = TiltPolicy(members, nothing, nothing, nothing, actions)
+        return TiltsState(policy, optimizer.begin(members), evidence, evidence, evidence)
 
     def monitor(self, state: TiltsState) -> Metrics:
         found = {"evidence": state.evidence.t, "share": state.policy.share}
         if state.policy.members.deep is not None:
             found |= {"evidence_of_depth": state.evidence_of_depth.t, "depth": state.policy.depth}
+        found |= {"evidence_of_speed": state.evidence_of_speed.t, "speed": state.policy.speed}
         return found | state.policy.trading.described
 
     def relearned(self, state: TiltsState) -> int:
@@ -255,7 +264,8 @@ class Tilts(Onlooker):
     ) -> tuple[TiltsState, Metrics]:
         assert isinstance(task, ExogenousTask)
         block = blocks_of(task, rollout, self.blocks, EVERY)
-        counted = jnp.arange(self.rollout_length)[:, None] >= self.head
+        later = jnp.arange(self.rollout_length)[:, None] >= self.head
+        counted = jnp.broadcast_to(later, block.shape)
         left = left_out(block, self.members)
         seen, unseen = counted & ~left, counted & left
         some = lambda x: x[:, ::EVERY]  # noqa: E731 (of the paths)
@@ -266,20 +276,23 @@ class Tilts(Onlooker):
             variance = mean(active**2) - mean(active) ** 2
             return mean(rewards) - self.tracking_aversion / 2 * variance
 
+        one = lambda trading: (jax.tree.map(lambda x: x[None], trading),)  # noqa: E731
+        (kept,) = self._paths(task, rollout, one(Trading.start(RATE, BAND)), (None,))
+
         def loss(members: Tilt) -> tuple[Array, tuple[Array, list[Array]]]:
             scores, share = self._scores(members, task, rollout), state.policy.share
-            resting = jax.tree.map(lambda x: x[None], members.resting)
-            (rested,) = self._paths(task, rollout, (resting,), (None,))
+            (rested,) = self._paths(task, rollout, one(members.resting), (None,))
             (rewards,) = self._paths(task, rollout, (members.trading,), (scores,))
-            anchored = lax.stop_gradient(rested)
-            active = [rewards - anchored]
+            sooner = lax.stop_gradient(rested) - kept
+            anchored = kept + state.policy.speed * sooner
+            active = [rewards - anchored, sooner]
             total = utility(rewards, active[0], seen)
             if members.deep is not None:
                 # On top of the policy as far as it is followed, and from some of the paths.
                 fewer, anchored = jax.tree.map(some, rollout), jax.vmap(some)(anchored)
                 base = lax.stop_gradient(share * jax.vmap(some)(scores))
                 higher = base + self._scores(members.deep, task, fewer)
-                followed = lax.stop_gradient(members.resting.towards(members.trading, share))
+                followed = lax.stop_gradient(state.policy.resting.towards(members.trading, share))
                 trades = members.deep.trading, followed
                 rewards, without = self._paths(task, fewer, trades, (higher, base))
                 active.append(rewards - without)
@@ -295,10 +308,13 @@ class Tilts(Onlooker):
         evidence = state.evidence.add(block, active[0], unseen, self.memory)
         of_depth = state.evidence_of_depth
         if members.deep is not None:
-            of_depth = of_depth.add(some(block), active[1], jax.vmap(some)(unseen), self.memory)
-        shares = evidence.share(self.threshold), of_depth.share(self.threshold)
-        policy = TiltPolicy(members, *shares, state.policy.actions)
-        return TiltsState(policy, adam, evidence, of_depth), {"loss": -gained}
+            of_depth = of_depth.add(some(block), active[2], jax.vmap(some)(unseen), self.memory)
+        # Two numbers, learned from all blocks, can hardly fit noise.
+        of_speed = state.evidence_of_speed.add(block, active[1], counted[None], self.memory)
+        every = evidence, of_depth, of_speed
+        share, depth, speed = (found.share(self.threshold) for found in every)
+        policy = TiltPolicy(members, share, depth, speed, state.policy.actions)
+        return TiltsState(policy, adam, *every), {"loss": -gained}
 
     def _scores(
         self, members: Tilt | Deep, task: ExogenousTask, rollout: Transition

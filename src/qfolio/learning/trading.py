@@ -9,6 +9,13 @@ from jaxtyping import Array, Float
 
 from qfolio.core import simplex
 
+RATE = 0.3
+"""Share of the way to a target that is traded at a step, unless another is learned."""
+
+BAND = 0.2
+"""How far a weight may drift from an anchor before it is traded, in units of the equal weight: a
+fifth, as Daryanani (2008) found for portfolios that are rebalanced."""
+
 
 class Trading(eqx.Module):
     """Trades a learned share of the way to the target, outside a learned band."""
@@ -17,9 +24,9 @@ class Trading(eqx.Module):
     band: Float[Array, ""]  # log of the untraded deviation, in units of the equal weight
 
     @staticmethod
-    def start(rate: float) -> "Trading":
-        """Trades the share ``rate`` at each step, outside a band of 5% of the equal weight."""
-        return Trading(jnp.array(math.log(rate / (1 - rate))), jnp.array(math.log(0.05)))
+    def start(rate: float = RATE, band: float = 0.05) -> "Trading":
+        """Trades the share ``rate`` at each step, outside a band in units of the equal weight."""
+        return Trading(jnp.array(math.log(rate / (1 - rate))), jnp.array(math.log(band)))
 
     @property
     def described(self) -> dict[str, Array]:

@@ -11,17 +11,10 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import MenuActions
 from qfolio.core.mdp import Discrete
-from qfolio.learning.trading import Trading, ratio
+from qfolio.learning.trading import BAND, RATE, Trading, ratio
 
 MOST = 2000
 """Largest number of allocations of a menu."""
-
-RATE = 0.3
-"""Fraction of the distance to its target that an order of the menu "signals" trades."""
-
-BAND = 0.2
-"""How far a weight may drift from the anchor before its first order trades, in units of the equal
-weight: a fifth, as Daryanani (2008) found for portfolios that are rebalanced."""
 
 LARGEST = 30.0
 """Tilts are cut here, where one asset has nearly all of the weight, so that exp is finite."""
@@ -117,7 +110,7 @@ class Menu(eqx.Module):
         bought = RATE + (1 - RATE) * ratio(jnp.maximum(idle, 0.0), anchor.sum())
         towards = simplex.with_rest(kept * assets + bought * target[1:])
         # Without a band, an agent that stays at the anchor pays for trades at every row.
-        trading = Trading(Trading.start(RATE).rate, jnp.log(jnp.array(BAND)))
+        trading = Trading.start(RATE, BAND)
         return jnp.where(choice == 0, trading(assets, simplex.with_rest(anchor), anchor), towards)
 
     @staticmethod
