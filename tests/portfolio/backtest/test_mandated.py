@@ -215,6 +215,24 @@ def test_equal_weights_are_those_of_what_a_mandate_allows():
     assert parts.tilts == pytest.approx(0, abs=0.02 * abs(parts.equal))
 
 
+@pytest.mark.parametrize(
+    ("trading", "calendar", "rows"),
+    [({"turnover": 0.3}, "monthly", 64), ({"turnover": 0.1}, "", 10), ({"fill": 5}, "", 5)],
+)
+def test_what_is_bought_once_is_bought_whole(trading, calendar, rows):
+    """However slowly equal weights are rebalanced: agents are compared with them."""
+    prices = price_table(random_walk(400, 3))
+    options = {"train": "200d", "calendar": calendar, "baselines": ["buy-and-hold"]}
+    backtest = create({"trading": trading}, prices=prices, **options)
+    entries, _ = backtest.replay.others(backtest.baselines, backtest._own, "equal-weight")
+    for name in ("buy-and-hold", "equal-weight at 0", "equal-weight at 0.01"):
+        cash = entries[name].simulation.weights[0, :, 0]
+        assert cash[0] > 0.5
+        np.testing.assert_allclose(cash[rows + 21 :], 0, atol=1e-6)
+    held, never = entries["buy-and-hold"], entries["equal-weight at 0"]
+    np.testing.assert_array_equal(held.simulation.returns, never.simulation.returns)
+
+
 def test_a_mandate_that_cannot_be_met_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(QfolioError, match=r"caps of assets \(10%\) and cash of at most 5% clash"):
         create({"assets": {"cap": 0.1}, "cash": {"max": 0.05}}, tmp_path / "run")

@@ -322,6 +322,7 @@ def test_a_return_on_a_day_between_rows_is_refused():
         ("pathwise-together", None, "already"), ("momentum", None, "already"),
         ("equal-weight at 0.3", None, "already"), ("/b", None, "cannot be called '/b'"),
         ("pathwise/0", None, "already has a strategy pathwise/0"), ("_b", None, "cannot be called"),
+        ("+carry", None, "cannot be called"), ("-1x", None, "cannot be called"),
         ("mine", "pathwise", "benchmark pathwise is an agent"),
         ("mine", "min", r"'min' is no baseline.*, and no file \(did you mean 'mine'\?\)"),
         ("A", None, "The table has an asset A; give your strategy of this name another one"),
@@ -384,6 +385,37 @@ def test_the_report_says_where_a_strategy_breaks_the_mandate():
     backtest = create(mandate=mandate, strategies={"calm": calm})
     notes = backtest.replay.others({}, backtest._own, "equal-weight")[1]
     assert any(note.startswith("calm keeps the mandate in all of its 60 orders") for note in notes)
+
+
+def test_a_strategy_breaks_limits_that_depend_on_what_it_held_and_traded_before():
+    mine = np.full((ROWS, 3), np.nan)
+    mine[[100, 120, 140]] = [[0.3, 0.3, 0.3], [0.0, 0.5, 0.4], [0.31, 0.29, 0.3]]
+    trading = {"turnover_a_year": 1.7, "smallest_trade": 0.05}
+    mandate = {"trading": trading, "risk": {"volatility": 9.0}}
+    backtest = create(mandate=mandate, strategies={"mine": mine})
+    (said,) = backtest.replay.others({}, backtest._own, "equal-weight")[1][-1:]
+    assert "breaks the mandate in 1 of its 3 orders" in said
+    assert "turnover of the year is too high (1, by up to 0.4" in said
+    mine[140] = [0.02, 0.5, 0.4]
+    backtest = create(mandate=mandate, strategies={"mine": mine})
+    (said,) = backtest.replay.others({}, backtest._own, "equal-weight")[1][-1:]
+    assert "a trade is too small (1, by up to 0.0" in said
+    mine[140] = np.nan
+    backtest = create(mandate=mandate, strategies={"mine": mine})
+    (said,) = backtest.replay.others({}, backtest._own, "equal-weight")[1][-1:]
+    assert said == "mine keeps the mandate but for its limits of risk in all of its 2 orders."
+
+
+@pytest.mark.parametrize("time", ["16:00", "16:00-05:00"])
+def test_levels_and_returns_of_the_close_belong_to_their_day(time):
+    prices = table()
+    dates = [f"{day} {time}" for day in DAYS]
+    level, _ = placed(pd.DataFrame({"date": dates, "level": prices.values[:, 0]}), prices)
+    rows = np.arange(FIRST, LAST + 1) + 1
+    np.testing.assert_allclose(level, prices.values[rows + 1, 0] / prices.values[rows, 0] - 1)
+    twice = [f"{DAYS[120]} 10:00{time[5:]}", *dates]
+    with pytest.raises(QfolioError, match=f"several returns on {DAYS[120]}, of which .* one row"):
+        placed(pd.DataFrame({"date": sorted(twice), "return": 0.001}), prices)
 
 
 def test_benchmarks_by_name():

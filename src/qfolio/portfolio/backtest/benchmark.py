@@ -19,7 +19,7 @@ from qfolio.portfolio.prices.table import Prices
 BENCHMARK = "benchmark"
 """Name of a benchmark that is given as a data frame or an array."""
 
-_NAME = re.compile(r"[A-Za-z0-9.&+%(-][\w.&+%()/:, -]{0,59}")
+_NAME = re.compile(r"[A-Za-z0-9.&%(][\w.&+%()/:, -]{0,59}")
 
 
 class Field(NamedTuple):
@@ -59,8 +59,8 @@ def field_of(
     own: dict[str, Own] = {}
 
     def add(name: str, source: Any) -> None:
-        column = name in prices.assets and csv_cell(name) == name  # of returns.csv
-        if not column and not _NAME.fullmatch(name):
+        column = csv_cell(name) == name  # as it is in returns.csv
+        if not column or (name not in prices.assets and not _NAME.fullmatch(name)):
             raise QfolioError(
                 f"A strategy cannot be called {quote(name)}; begin with a letter or digit, and use "
                 "up to 60 letters, digits, spaces and the signs . , : & + - _ / % ( )."

@@ -12,6 +12,7 @@ from qfolio.portfolio.backtest.attribution.replays import AT_ONCE
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS
 from qfolio.portfolio.backtest.folder import BacktestConfig
 from qfolio.portfolio.backtest.folds import walk_forward
+from qfolio.portfolio.backtest.statistics.bootstrap import CHUNK, TOGETHER
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
@@ -55,7 +56,9 @@ def total(
     followed = len(channels) * (seeds + (seeds > 1)) + others
     replayed = 2 * 8 * path * (followed + len(channels))  # decisions, weights, and their means
     explained = 2 * 4 * 2 * path * AT_ONCE  # targets and holdings of replays, and joined ones
-    return values + observed + max(made, replayed + explained)
+    judged = 2 * 8 * 13 * days * followed  # what statistics average over days, and a copy
+    judged += 40 * max(TOGETHER * days, CHUNK)  # resampled days: numbers, draws and counts
+    return values + observed + max(made, replayed + max(explained, judged))
 
 
 def require(prices: Prices, config: BacktestConfig) -> None:

@@ -93,9 +93,9 @@ def orders(
     account = _Account(growth, terms, universe, first)
     asks, gives = _calendar(baseline, folds, len(prices), month, terms, universe)
     decisions, notes = np.full((decided.stop - first, prices.shape[1] + 1), np.nan), []
+    wanted, entering = None, baseline.buys_once
     for number, fold in enumerate(folds):
         tradable = _tradable(baseline, fold, prices, universe)
-        wanted = None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             for row in range(fold.decisions.start, fold.decisions.stop):
@@ -103,9 +103,11 @@ def orders(
                     continue  # nothing can happen, as on most days of a monthly calendar
                 held = account.held(row)
                 called = terms.calls(held)
+                waits = baseline.buys_once and account.filling
+                anew = asks[row] and not waits and (wanted is None or not entering)
                 # A margin call asks for a new target, unless that of the fold stands.
-                asked = asks[row] or (called and baseline.calendar != "fold")
-                due = gives[row] or called
+                asked = anew or (called and baseline.calendar != "fold")
+                due = (gives[row] and not waits) or called
                 mandated = feasible(number, row) if feasible and (asked or due) else None
                 if asked:
                     known = slice(0, row + 1)
@@ -117,6 +119,7 @@ def orders(
                 order = None
                 if due and goal is not None:
                     order = obeying(goal, held, account.within_turnover(mandated))
+                    entering = entering and _cut(order, goal, held, mandated)
                 decisions[row - first] = account.trade(row, held, order)
         said = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
         notes += [f"{name}, fold {fold.name}: {note}" for note in said]
@@ -174,6 +177,11 @@ class _Account:
         self.plan = terms.begin(self.weights)
 
     @property
+    def filling(self) -> bool:
+        """Whether a part of an order is still to be filled."""
+        return self.plan is not None and bool(self.plan.left > 0)
+
+    @property
     def watched(self) -> bool:
         """Whether it may trade at any row, for a lender or by a plan."""
         return self.plan is not None or self.terms.called < np.inf
@@ -225,6 +233,14 @@ def ask(
 def obeying(wanted: Floats, held: Floats, mandated: Feasible | None) -> Floats:
     """Target weights, projected onto what a mandate allows, if there is one."""
     return wanted if mandated is None else exactly(mandated, wanted, held)
+
+
+def _cut(order: Floats, wanted: Floats, held: Floats, mandated: Feasible | None) -> bool:
+    """Whether a mandate's limit on turnover has cut an order."""
+    if not isinstance(mandated, Mandated):
+        return False
+    whole = obeying(wanted, held, mandated.at_once)
+    return bool(abs(order - whole).max() > TOLERANCE)
 
 
 def checked(name: str, wanted: ArrayLike, history: History) -> Floats:

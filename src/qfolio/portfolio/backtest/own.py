@@ -164,28 +164,36 @@ def _placed_weights(
 
 
 def compliance(
-    name: str, decisions: Floats, turnover: Floats, mandates: Sequence[tuple[slice, Mandated]]
+    name: str,
+    decisions: Floats,
+    held: Floats,
+    mandates: Sequence[tuple[slice, Mandated]],
+    spare: Floats,
 ) -> str:
     """Says where a strategy's orders break the mandate; they are carried out all the same.
+
+    Limits of risk are left to ``notes.too_risky``.
 
     Args:
         name: Name of the strategy.
         decisions: The orders of the strategy, of shape (D, N + 1), cash first, NaN for no order.
-        turnover: Turnover of each order, of shape (D,).
+        held: The weights before each order, likewise.
         mandates: What is allowed on some of the D days.
+        spare: What is left of each year's turnover after each order, of shape (D,).
     """
     broken: dict[str, list[float]] = {}
     orders = days = 0
     for some, allowed in mandates:
         given = ~np.isnan(decisions[some, 0])
-        found = allowed.violations(decisions[some])
-        found["turnover is too high by"] = turnover[some] - float(allowed.limits.turnover)
+        found = allowed.violations(decisions[some], held[some])
+        found["turnover of the year is too high by"] = -spare[some]
         excess = np.array(list(found.values()))[:, given]
         orders, days = orders + int(given.sum()), days + int((excess > TOLERANCE).any(0).sum())
         for said, by in zip(found, excess, strict=True):
             broken.setdefault(said.removesuffix(" by"), []).extend(by[by > TOLERANCE].tolist())
     if not days:
-        return f"{name} keeps the mandate in all of its {amount(orders, 'order')}."
+        but = " but for its limits of risk" if mandates[0][1].limits_risk else ""
+        return f"{name} keeps the mandate{but} in all of its {amount(orders, 'order')}."
     how = ", ".join(
         f"{said} ({len(by)}, by up to {max(by):.2g})" for said, by in broken.items() if by
     )
@@ -236,6 +244,13 @@ def _returns(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
             f"{name} has a return on {inside[0]}, which is not a row of the prices; give a return "
             "for each row, from one row to the next."
         )
+    days = own.dates.astype("datetime64[D]")
+    several = (rows[1:] == rows[:-1]) & (days[1:] == days[:-1])
+    if several.any():
+        raise QfolioError(
+            f"{name} has several returns on {days[:-1][several][0]}, of which the prices have one "
+            "row; give one return for each row, compounded."
+        )
     at = np.full(len(prices) + 1, np.nan)
     at[rows] = own.values
     found = at[earned]
@@ -280,11 +295,17 @@ def require_levels(name: str, own: Own, prices: Prices) -> None:
 
 
 def _levels(own: Own, rows: Dates) -> tuple[Rows, Bools]:
-    """The number of the last level that is known at each row, and whether it is none or too old."""
-    if (own.dates == own.dates.astype("datetime64[D]")).all():
-        rows = rows.astype("datetime64[D]")
-    latest = np.searchsorted(own.dates, rows, side="right") - 1
-    return latest, (latest < 0) | (rows - own.dates[np.maximum(latest, 0)] > OLDEST)
+    """The number of the last level that is known at each row, and whether it is none or too old.
+
+    Where the rows or the levels are one a day, those of the same day belong together: a row of a
+    day is its close.
+    """
+    dates, by_day = own.dates, rows.astype("datetime64[D]")
+    days = dates.astype("datetime64[D]")
+    if (by_day[1:] > by_day[:-1]).all() or (dates == days).all():
+        dates, rows = days, by_day
+    latest = np.searchsorted(dates, rows, side="right") - 1
+    return latest, (latest < 0) | (rows - dates[np.maximum(latest, 0)] > OLDEST)
 
 
 def _day(prices: Prices, row: int | np.integer) -> str:

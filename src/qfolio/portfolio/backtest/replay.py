@@ -15,6 +15,7 @@ from qfolio.portfolio.backtest.baselines import Baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
 from qfolio.portfolio.backtest.folds import Fold, days_of, tested
+from qfolio.portfolio.backtest.growth import Growth, filled_in
 from qfolio.portfolio.backtest.orders import Orders, orders
 from qfolio.portfolio.backtest.own import Placed, compliance
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
@@ -249,7 +250,24 @@ class Replay:
             rows = np.arange(fold.decisions.start, fold.decisions.stop)
             here = made if self.patterns is None else self.patterns[0].at(rows, made)
             allowed.append((days, here))
-        return compliance(name, entry.decisions[0], entry.simulation.turnover[0], allowed)
+        decisions, first = entry.decisions[0], self.folds[0].decisions.start
+        held = self._held(decisions, first)
+        spent, elapsed = np.nan_to_num(abs(decisions - held)[:, 1:].sum(1)), self.terms.elapsed
+        spare = np.full(len(spent), np.inf)
+        if len(elapsed):
+            year = elapsed[first : first + len(spent)].astype(int)
+            before = np.append(0.0, spent.cumsum())[np.searchsorted(year, year)]
+            spare = self.terms.turnover - (spent.cumsum() - before)
+        return compliance(name, decisions, held, allowed, spare)
+
+    def _held(self, decisions: np.ndarray, first: int) -> np.ndarray:
+        """The weights before each of some decisions, (day, entry), the first of them at a row."""
+        growth = Growth(filled_in(self.prices.values)[0], self.task.costs, self._conditions)
+        held, weights, row = np.full_like(decisions, np.nan), np.eye(decisions.shape[1])[0], first
+        for day in np.flatnonzero(~np.isnan(decisions[:, 0])).tolist():
+            held[day] = growth.held(weights, row, first + day)
+            weights, row = decisions[day], first + day
+        return held
 
     def entry(self, kind: str, decisions: np.ndarray, costs: CostModel | None = None) -> Entry:
         """A strategy by its decisions of shape (seed, day, entry); costs: default, the task's."""

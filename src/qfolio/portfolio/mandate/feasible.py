@@ -137,6 +137,13 @@ class Mandated(Feasible):
         return dataclasses.replace(self, limits=self.limits._replace(turnover=least))
 
     @property
+    def at_once(self) -> "Mandated":
+        """The set without a limit on turnover."""
+        turnover, xp = self.limits.turnover, self.limits.high.__array_namespace__()
+        free = self.limits._replace(turnover=xp.full_like(turnover, xp.inf))
+        return dataclasses.replace(self, limits=free)
+
+    @property
     def long_only(self) -> bool:
         return self.long
 
@@ -163,8 +170,7 @@ class Mandated(Feasible):
         drawn = CappedSimplex(jnp.ones_like(self.limits.high)).draw(key)
         never = float("inf")
         free = dataclasses.replace(
-            self,
-            limits=self.limits._replace(turnover=jnp.array(never)),
+            self.at_once,
             smallest_trade=0.0,
             volatility=never,
             tracking_error=never,

@@ -41,6 +41,7 @@ class EqualWeightAt(Baseline):
 
     calendar = "row"
     estimates = False
+    buys_once = True
 
     def __init__(self, speed: float) -> None:
         self.speed = speed  # share of the way, from 0 (never) to 1
@@ -82,6 +83,7 @@ class BuyAndHold(Baseline):
 
     calendar = "row"
     estimates = False
+    buys_once = True
 
     def decide(self, history: History, held: Floats) -> Floats | None:
         return None if held[1:].any() else with_cash(equal_weights(history), history)

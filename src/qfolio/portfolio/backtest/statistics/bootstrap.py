@@ -22,9 +22,11 @@ from qfolio.portfolio.backtest.statistics.measures import (
 LEVEL = 0.95
 """Coverage of all intervals, and the probability required for a claim."""
 
-_CHUNK = 2_000_000  # resampled days held at a time: tens of megabytes, whatever the resamples
+CHUNK = 2_000_000
+"""Resampled days held at a time: tens of megabytes, whatever the resamples."""
 
-_TOGETHER = 100  # fewest histories at a time, because each chunk loops over all days in Python
+TOGETHER = 100
+"""Fewest histories at a time, because each chunk loops over all days in Python."""
 
 
 def block_length(series: ArrayLike) -> float:
@@ -100,7 +102,7 @@ def histories(
         Their days, and how often each day was drawn, both of shape (some, periods). Averages over a
         history depend only on the latter, so they are one matrix product.
     """
-    chunk = max(_TOGETHER, _CHUNK // periods)
+    chunk = max(TOGETHER, CHUNK // periods)
     for start in range(0, resamples, chunk):
         size = min(chunk, resamples - start)
         days = stationary_bootstrap_indices(periods, block, size, rng)
