@@ -124,9 +124,12 @@ def test_holdings_from_before_the_last_orders_are_named(copy, monkeypatch, capsy
     newer = write_table(tmp_path / "newer.csv", rows=270)
     of = ["allocate", copy, "--agent", "equal-weight", "--capital"]
     stale = "The holdings are those of record 1 before its trades; if these were filled, export"
+    later, holdings = ["--prices", newer, "--as-of", "2020-09-26"], tmp_path / "holdings.csv"
+    holdings.write_text("asset,shares\nA,1\n")
     for capital, more, named in (
-        (1000, AS_OF, False), (1000, ["--prices", newer, "--as-of", "2020-09-26"], True),
-        (1001, ["--prices", newer, "--as-of", "2020-09-26"], False),
+        (1000, AS_OF, False), (1000, later, True),
+        (1000.01, later, True),  # interest or a fee
+        (1000, [*later, "--holdings", holdings], False),
     ):  # fmt: skip
         assert qfolio(monkeypatch, *of, capital, *more) == 0
         assert (stale in " ".join(capsys.readouterr().out.split())) == named

@@ -201,6 +201,12 @@ def test_nothing_is_learned_twice(policy):
         updated.update(table().between(0, 61))
 
 
+def test_an_update_learns_from_as_many_rows_as_before(policy):
+    with pytest.raises(QfolioError, match=r"has 59 rows, .* learned from 60; give earlier prices"):
+        policy.update(table().between(-59, None))
+    assert policy.update(table().between(-60, None)).rows == policy.rows == 60
+
+
 def test_an_asset_needs_a_price_all_over_the_window(policy):
     def joined(row):
         new = table()

@@ -25,6 +25,7 @@ from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.rule import Rule
+from qfolio.portfolio.following import on_table
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.feasible import exactly
 from qfolio.portfolio.mandate.limits import feasible, mandate_text
@@ -736,3 +737,33 @@ def test_what_a_delisting_costs_or_pays_earns_what_cash_does_without_an_order(sh
     np.testing.assert_allclose(
         replay(decisions=decisions).returns[10:], replay(decisions=cash).returns[10:], atol=1e-12
     )
+
+
+def late_then_ending(rows: int = 120) -> tuple[Prices, Prices]:
+    """A table in which D starts late, and the same in which C then ends."""
+    frame = frame_of(rows, 4)
+    frame.iloc[: rows - 20, 3] = np.nan
+    late = load(frame, late="join")
+    frame.iloc[rows - 5 :, 2] = np.nan
+    return late, load(frame, late="join", ended="cash-out")
+
+
+@pytest.mark.parametrize("limits", [{"max_weight": 0.5}, {"mandate": {"assets": {"cap": 0.5}}}])
+def test_a_first_delisting_opens_no_asset_that_training_did_not_cover(limits: dict[str, Any]):
+    late, ended = late_then_ending()
+    task = Portfolio.of(late, window=5, horizon=10, **limits)
+    live, last = on_table(task, ended), jnp.array(len(ended) - 1)
+    cash, wanted = jnp.eye(5)[0], jnp.array([0.0, 0.1, 0.1, 0.1, 0.7])
+    ordered = live.allow(last, live.hold(cash), wanted)
+    assert ordered[4] == pytest.approx(0, abs=1e-6)
+    again = on_table(task.on_rows(ended, 60), ended)  # an update covers it
+    assert again.allow(last, again.hold(cash), wanted)[4] == pytest.approx(0.5, abs=1e-5)
+
+
+def test_floors_yield_where_training_did_not_cover_their_asset():
+    late, ended = late_then_ending()
+    groups = {"kind": {"late": {"assets": ["D"], "floor": 0.1}}}
+    task = Portfolio.of(late, window=5, horizon=10, mandate={"groups": groups})
+    live, last, first = on_table(task, ended), jnp.array(len(ended) - 1), jnp.eye(5)[1]
+    ordered = live.allow(last, live.hold(jnp.eye(5)[0]), first)
+    np.testing.assert_allclose(ordered, first, atol=1e-5)

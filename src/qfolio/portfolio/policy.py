@@ -171,8 +171,8 @@ class Policy:
                 many as before if it learns anew).
 
         Raises:
-            QfolioError: The learning state was not saved, the table does not fit, or it has no row
-                newer than those already learned from.
+            QfolioError: The learning state was not saved, the table does not fit, has fewer rows
+                than the policy was trained on, or has none newer than those already learned from.
         """
         if self.learner is None:
             raise QfolioError(
@@ -187,7 +187,13 @@ class Policy:
                 f"The prices end on {day(table.dates[-1])}, but the policy has already learned "
                 f"from those up to {day(self.learned)}; give newer prices, or leave out the update."
             )
-        task = self.task.on_rows(table, max(0, len(table) - self.rows))
+        if len(table) < self.rows:
+            raise QfolioError(
+                f"The price table has {amount(len(table), 'row')}, too few for an update: the "
+                f"policy learned from {self.rows}; give earlier prices, too, or leave out the "
+                "update."
+            )
+        task = self.task.on_rows(table, len(table) - self.rows)
         task = task.having(center=self.task.center, scale=self.task.scale)
         rollouts = self.agent.relearned(self.learner)
         agent = self.agent if rollouts else _slowed(self.agent)

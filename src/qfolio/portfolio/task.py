@@ -142,7 +142,9 @@ class Portfolio(Market):
         Signals and anchors look back on the rows before.
         """
         there = ~np.isnan(prices.values[first]) if prices.tradable is None else None
-        return self.on(prices).part(first, len(prices) - 1, there)
+        every = np.ones(len(prices.assets), bool)  # it may learn to hold what it could not before
+        task = self.having(allowed=_allowed(self.mandate, every, self.max_weight))
+        return task.on(prices).part(first, len(prices) - 1, there)
 
     def on(self, prices: Prices) -> "Portfolio":
         """The same task on another table, otherwise unchanged."""
@@ -174,8 +176,11 @@ class Portfolio(Market):
         decides[-1:] = True  # tomorrow's weights may be asked for on any day
         tradable, patterns = prices.tradable, None
         joined = prices.first_rows.astype(np.int32)
-        if tradable is not None and self.mandate:
-            patterns = Patterns.of(self.mandate, tradable, self.max_weight)[0].in_float32()
+        if tradable is not None and self.allowed is not None:
+            # What training did not cover stays closed, also once the first asset has ended.
+            low, high = map(np.asarray, self.allowed.limits[:2])
+            may = tradable & ((low != 0) | (high != 0))
+            patterns = Patterns.of(self.mandate, may, self.max_weight)[0].in_float32()
         numbers = {
             "log_relatives": logs, "extra": extra, "anchors": followed, "conditions": then,
             "elapsed": passed, "benchmarks": compared, "covariances": estimated, "year": year,

@@ -438,3 +438,10 @@ def test_benchmarks_by_name():
     framed = create(benchmark=weights([0], A=[1.0]))
     assert framed.config.benchmark == "benchmark"
     assert isinstance(read_own("x", mine, table()), Own)
+
+
+def test_orders_in_shares_need_share_prices():
+    orders = weights([20, 20], asset=["cash", "A"], shares=[8000, 100])
+    cumulated = dataclasses.replace(table(), levels=True)
+    with pytest.raises(QfolioError, match="Strategy 'house': orders in shares need share prices"):
+        read_own("house", orders, cumulated)

@@ -1,6 +1,7 @@
 """The trades that lead from holdings to target weights."""
 
 import dataclasses
+import datetime
 
 import numpy as np
 import pytest
@@ -226,6 +227,22 @@ def test_prices_of_another_day():
     for day in ("NaT", "today", "2025", ""):  # numpy reads these
         with pytest.raises(QfolioError, match=f"--as-of is '{day}'; it must be a date"):
             require_fresh(PRICES, day)
+
+
+def test_rows_in_utc_are_not_after_today_in_an_evening_of_the_west(monkeypatch):
+    class Yesterday(datetime.date):
+        @classmethod
+        def today(cls):
+            return datetime.datetime.now(datetime.UTC).date() - datetime.timedelta(days=1)
+
+    monkeypatch.setattr("datetime.date", Yesterday)
+    now = np.datetime64("now", "s")
+    hourly = Prices(now - np.arange(3)[::-1] * np.timedelta64(3600, "s"), ("A",), np.ones((3, 1)))
+    require_fresh(hourly, None)
+    with pytest.raises(QfolioError, match="leave out the later rows"):
+        require_fresh(
+            dataclasses.replace(hourly, dates=hourly.dates + np.timedelta64(1, "D")), None
+        )
 
 
 @pytest.mark.parametrize("whole", [False, True])

@@ -2,16 +2,21 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
+from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines import baseline
-from qfolio.portfolio.desk.desk import lookback, waiting
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.desk.desk import Desk, lookback, waiting
 from qfolio.portfolio.desk.rule import Rule
 from qfolio.portfolio.policy import Policy
-from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 
 from planted import Known, planted
+from tables import days, random_walk
+from tiny import PATHWISE
 
 MONTHS = np.arange("2024-01", "2025-01", dtype="datetime64[M]").astype("datetime64[D]")
 WEEKS = np.datetime64("2024-01-05") + 7 * np.arange(10)
@@ -65,3 +70,24 @@ def test_an_agent_looks_back_with_its_anchor_and_its_limits(settings, found):
     task = Portfolio.of(prices, window=2, **settings)
     policy = Policy(task, Known("momentum"), jnp.array([0.5]), prices.assets)
     assert lookback(policy, prices.dates, prices.month) == found
+
+
+def test_prices_without_an_asset_delisted_before_they_begin_are_to_begin_earlier(tmp_path):
+    values = random_walk(160, drift=3e-4)
+    values[50:, 2] = np.nan
+    frame = pd.DataFrame(values, pd.DatetimeIndex(days(160), name="date"), list("ABC"))
+    Backtest.create(
+        load(frame, ended="cash-out"), {"pathwise": PATHWISE}, out=tmp_path / "run", train="100d",
+        test="60d", seeds=1, baselines=[],
+    )  # fmt: skip
+    desk, latest = Desk.open(tmp_path / "run"), tmp_path / "latest.csv"
+    frame[60:].to_csv(latest)
+    with pytest.raises(QfolioError, match=r"no prices at all.* Give prices from before it was del"):
+        desk.read(latest)
+    frame[60:].drop(columns="C").to_csv(latest)
+    with pytest.raises(
+        QfolioError, match=r"lacks C \(2020-02-19\), delisted in the backtest; give"
+    ):
+        desk.read(latest)
+    frame[40:].to_csv(latest)
+    assert desk.read(latest).assets == desk.run.prices.assets

@@ -82,6 +82,7 @@ def test_all_digits_of_shares_that_are_cashed_out_are_shown():
         ("asset,shares\nBBB,1\nAAA,1,000\n", "there are 3 fields, but 2 column names"),
         ("asset,shares\nAAA,1,000\n", "row 2: there are 3 fields, but 2 column names"),
         ('asset,shares\nAAA,"1,000"\n', "line 2: '1,000' may mean 1000 or 1.000"),
+        ("asset\tshares\nAAA\t1.500\n", "'1.500' may mean 1500 or 1.500"),
         ("asset,shares\nAAA,1_000\n", "line 2: '1_000' is not a number"),
         ("asset,shares\nAAA,１２\n", "line 2: '１２' is not a number"),
         ("asset,shares\nAAA,$5\n", "line 2: '$5' is not a number"),

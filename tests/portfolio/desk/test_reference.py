@@ -1,5 +1,7 @@
 """The benchmark over live rows, without any training."""
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -8,6 +10,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.reference import reference
+from qfolio.portfolio.prices.table import load
 
 from tables import days, price_table, random_walk
 from tiny import PATHWISE
@@ -52,6 +55,25 @@ def test_the_benchmark_earns_what_the_backtest_says(tmp_path, benchmark, options
     found, note = reference(made, run.prices, decisions.start, count, None)
     np.testing.assert_array_equal(found, entries[name].simulation.returns[0])
     assert note == ""
+
+
+def test_what_a_delisted_asset_paid_out_is_no_price_to_learn_from(tmp_path):
+    """It started late, so that with its prices the training would have to start late, too."""
+    values = random_walk(160, 4, drift=3e-4)
+    values[:20, 3] = values[50:, 3] = np.nan
+    frame = pd.DataFrame(values, pd.DatetimeIndex(days(160), name="date"), list("ABCD"))
+    prices = load(frame, late="join", ended="cash-out")
+    Backtest.create(
+        prices, AGENTS, out=tmp_path / "run", train="100d", test="30d", seeds=1, baselines=[],
+        benchmark="minimum-variance",
+    )  # fmt: skip
+    made = Desk.open(tmp_path / "run")
+    run, fold = made.run, made.run.folds[1]
+    entry, _ = dataclasses.replace(run.replay, folds=[fold]).baseline(
+        "baseline", "minimum-variance", run.baselines["minimum-variance"]
+    )
+    found, _ = reference(made, prices, fold.decisions.start, fold.days, None)
+    np.testing.assert_array_equal(found, entry.simulation.returns[0])
 
 
 def test_a_table_of_ones_own_goes_on_with_its_latest_rows(tmp_path):

@@ -193,3 +193,22 @@ def test_prices_that_begin_later_than_a_baseline_looks_back_are_named(desk):
         said[name] = " ".join(desk.terms(rule, prices, allocation, 0.0))
     assert "begin on 2020-01-31, but momentum looks back to 2020-01-01; give" in said["momentum"]
     assert "looks back" not in said["equal-weight"]
+
+
+def test_prices_from_which_an_asset_does_not_seem_late_are_named(tmp_path):
+    """C has prices in all of a table that begins late, but not in the training window."""
+    values = table().values.copy()
+    values[:90, 2] = np.nan
+    prices = price_table(values)
+    Backtest.create(
+        prices, AGENTS, out=tmp_path / "run", train="100d", test="50d", seeds=1,
+        baselines=["momentum"],
+    )  # fmt: skip
+    desk = Desk.open(tmp_path / "run")
+    for name in ("equal-weight", "momentum"):
+        rule, said = desk.followed(name), []
+        for known in (prices, prices.between(95, None)):
+            allocation = Allocation.of(rule, known, np.zeros(3), 1000.0)
+            said.append(" ".join(desk.terms(rule, known, allocation, 0.0)))
+        assert "looks back" not in said[0]
+        assert f"begin on 2020-04-05, but {name} looks back to 20" in said[1]

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.prices.table import Prices, load
+from qfolio.portfolio.prices.table import Prices, inspect, load
 
 from tables import findings
 
@@ -237,9 +237,10 @@ def test_points_that_may_be_either(tmp_path: Path):
     assert "column 'A': there are no numbers: '1.234' may mean 1234 or 1.234" in said
     assert "write its numbers as 1234.5" in said
     cells = [["1.234", "900"], ["1.250", "905"], ["1.270", "903"], ["1.290", "901"]]
-    said = refusal(write(tmp_path, "date;A;B\n" + rows(ISO, cells, ";")))
-    assert "'1.234' may mean 1234 or 1.234, and no other number tells which" in said
-    assert "separate the columns by commas" in said
+    for mark in ";\t|":
+        said = refusal(write(tmp_path, f"date{mark}A{mark}B\n" + rows(ISO, cells, mark)))
+        assert "'1.234' may mean 1234 or 1.234, and no other number tells which" in said
+        assert "separate the columns by commas" in said
     text = "date,A,B\n" + rows(ISO, cells)
     assert load(write(tmp_path, text)).values[0].tolist() == [1.234, 900]
     cells[0][1] = "900.5"
@@ -341,6 +342,49 @@ def test_a_folder_of_one_file_an_asset(tmp_path: Path):
     bars(tmp_path, "late.csv", ["2", "3", "4"], [ISO[0], *ISO[2:]])
     assert "2024-01-30, column 'close': the price of 'late' is missing" in refusal(tmp_path)
     assert load(tmp_path, missing="forward-fill").values[1, 1] == 2
+
+
+def test_gaps_of_a_folder_are_treated_in_the_joined_table(tmp_path: Path):
+    bars(tmp_path, "a.csv", ["1", "2", "3", "4"])
+    bars(tmp_path, "b.csv", ["5", "6", "7", ""])
+    bars(tmp_path, "c.csv", ["8", "7", "8", "9"])
+    assert "column 'close': 'b': there are no prices after 2024-01-31" in refusal(tmp_path)
+    assert load(tmp_path, missing="drop-asset").assets == ("a", "c")
+    filled = load(tmp_path, missing="forward-fill")
+    assert filled.values[-1].tolist() == [4, 7, 9]
+    assert "the last row has no price of 'b', and takes an earlier one" in filled.note
+    ended = load(tmp_path, ended="cash-out")
+    assert ended.listed is not None
+    assert ended.listed[-1].tolist() == [True, False, True]
+    bars(tmp_path, "b.csv", [""] * 4)
+    assert "'b': there are no prices at all" in refusal(tmp_path)
+
+
+def test_rows_without_any_number_in_a_folder_are_left_out(tmp_path: Path):
+    for name, late in (("A", "2"), ("B", "")):
+        text = f"date,{name}\n" + rows(ISO, [["1"], ["2"], [""], [late]])
+        (tmp_path / f"{name}.csv").write_text(text)
+    prices, found = inspect(tmp_path, missing="forward-fill")
+    assert prices is not None
+    assert prices.values[:, 1].tolist() == [1, 2, 2]
+    said = "2024-01-31: left out: 1 row without any number; the latest has this date"
+    assert said in [str(each) for each in found]
+
+
+def test_a_folder_has_the_warnings_of_its_files(tmp_path: Path):
+    bars(tmp_path, "a.csv", ["1", "2", "3", "4"])
+    text = "date,ticker,close,currency\n" + rows(
+        ISO, [["B", "1", "USD"], ["B", "2", "EUR"], ["B", "3", "USD"], ["B", "4", "USD"]]
+    )
+    (tmp_path / "b.csv").write_text(text)
+    said = [str(each) for each in inspect(tmp_path)[1]]
+    assert "column 'currency': in 'b.csv': there are several currencies: EUR and USD" in said
+
+
+def test_the_files_of_a_folder_have_one_currency(tmp_path: Path):
+    for name, sign in (("a", "$"), ("b", "€")):
+        bars(tmp_path, f"{name}.csv", [f"{sign}{price}" for price in (1, 2, 3, 4)])
+    assert "prices are in several currencies: $ and €" in refusal(tmp_path)
 
 
 def test_a_folder_of_returns(tmp_path: Path):

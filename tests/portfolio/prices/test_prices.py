@@ -138,6 +138,11 @@ def test_zones_name_a_day_or_become_utc():
     zoned.index = zoned.index.tz_localize("Asia/Tokyo")
     assert load(zoned).digest == load(frame()).digest
     assert load(pa.Table.from_pandas(zoned.rename_axis("date"))).digest == load(frame()).digest
+    download = zoned.copy()  # before the close of the last day
+    download.index = [*zoned.index[:-1], zoned.index[-1].replace(hour=8, minute=30)]
+    days = load(download).dates
+    assert days.astype("datetime64[D]").astype(str).tolist() == DAYS
+    assert str(days[-1]) == "2020-01-08T08:30:00"
     hourly = pd.date_range("2020-10-25", periods=5, freq="h", tz="Europe/Berlin")  # 2 a.m. twice
     prices = load(pd.DataFrame({"A": A}, index=hourly))
     assert str(prices.dates[0]) == "2020-10-24T22:00:00"

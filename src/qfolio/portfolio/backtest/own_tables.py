@@ -181,6 +181,8 @@ def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Pric
     Shares are valued at the close of the row that decides; the effects of costs and of the lag are
     not known yet.
     """
+    if prices.levels:
+        raise QfolioError("orders in shares need share prices, not returns; give weights.")
     dates = dates_of(table, when)
     traded = numbers_of(table, shares, dates)
     rows, _ = rows_at("It", dates, prices)

@@ -292,7 +292,9 @@ def require_fresh(prices: Prices, as_of: str | None) -> None:
             f"--as-of is {quote(as_of)}; it must be a date such as 2025-12-31."
         ) from None
     last = prices.dates[-1].astype("datetime64[D]").item()
-    if last > today:
+    # Intraday rows are in UTC, where the next day has begun in an American evening.
+    newest = max(today, datetime.datetime.now(datetime.UTC).date()) if as_of is None else today
+    if last > newest:
         raise QfolioError(
             f"The prices end on {last}, after {today}; leave out the later rows, or set "
             "a later --as-of."

@@ -25,7 +25,7 @@ from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
 from qfolio.portfolio.desk.rule import Ordered, Rule, Untrained
 from qfolio.portfolio.desk.standing import Kind
-from qfolio.portfolio.policy import Policy
+from qfolio.portfolio.policy import UNKNOWN, Policy
 from qfolio.portfolio.prices.findings import Finding, day, first_of
 from qfolio.portfolio.prices.frequency import require_alike, spacing
 from qfolio.portfolio.prices.table import Prices, accepted, inspect
@@ -151,8 +151,16 @@ class Desk:
                 "The backtest's universe has members that change over time; give the latest "
                 "memberships with --members."
             )
-        table = table.exactly(self.run.prices.assets, "the backtest")
-        require_alike(table.dates, self.run.prices.periods_per_year, "the backtest has")
+        known = self.run.prices
+        if known.listed is not None:
+            gone = np.flatnonzero(~known.listed[-1] & ~np.isin(known.assets, table.assets)).tolist()
+            if gone:
+                raise QfolioError(
+                    f"The price table lacks {_with_ends(known, gone)}, delisted in the backtest; "
+                    "give prices that begin earlier, as the backtest's do."
+                )
+        table = table.exactly(known.assets, "the backtest")
+        require_alike(table.dates, known.periods_per_year, "the backtest has")
         self._require_last_prices(table)
         return table
 
@@ -250,19 +258,24 @@ class Desk:
             yield f"These assets count as delisted since the backtest: {_with_ends(table, ended)}."
         dates = self.run.prices.dates
         known = np.concatenate([dates[dates < table.dates[0]], table.dates])
-        what, rows = lookback(followed, known, table.month)
+        late = UNKNOWN  # where assets come and go, each may be held from its first price on
+        if table.tradable is None:
+            before = self.run.prices
+            late = before.dates[min(int(before.first_rows.max()), len(before) - 1)]
+        what, rows = lookback(followed, known, table.month, late)
         if rows > len(table):
             yield (
                 f"The prices begin on {day(table.dates[0])}, but {what} looks back to "
                 f"{day(known[-rows])}; give them from there on, as the backtest has them, or the "
                 "orders may differ from those that it would give."
             )
-        before = [record for record in self.ledger.current() if record.moment < table.dates[-1]]
-        held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
-        if before and any(before[-1].trades) and before[-1].digests["holdings"] == held:
+        records = [record for record in self.ledger.current() if record.moment < table.dates[-1]]
+        # Cash may have earned interest since, or paid a fee.
+        same = records and np.allclose(allocation.shares, records[-1].shares, rtol=1e-9, atol=1e-5)
+        if same and any(records[-1].trades):
             yield (
-                f"The holdings are those of record {before[-1].number} before its trades; if these "
-                "were filled, export the holdings again."
+                f"The holdings are those of record {records[-1].number} before its trades; if "
+                "these were filled, export the holdings again."
             )
 
     def _pending(self, table: Prices) -> list[str]:
@@ -407,18 +420,27 @@ class Desk:
         return found
 
 
-def lookback(followed: Policy | Untrained, dates: np.ndarray, month: int) -> tuple[str, int]:
-    """What of a strategy's estimates looks back on most rows of a table, and on how many.
+def lookback(
+    followed: Policy | Untrained, dates: np.ndarray, month: int, late: np.datetime64 = UNKNOWN
+) -> tuple[str, int]:
+    """What of a strategy looks back on most rows of a table, and on how many.
 
     A policy's signals are not counted: it needs the rows that they look back on.
+
+    late: date of the first price of the last asset to start. A baseline holds an asset once it has
+    prices in all of the training window, and cannot tell where these begin later.
     """
     found = {"": 0}
     task = followed.task
-    if isinstance(followed, Rule) and followed.baseline.estimates:
-        train = latest("", dates, followed.train, followed.expanding).train
-        months, least = followed.baseline.months, followed.baseline.least
-        window = len(dates) if months is None else window_rows(months, least, month)
-        found[followed.name] = min(window, train.stop - train.start)
+    if isinstance(followed, Rule):
+        fold, rows = latest("", dates, followed.train, followed.expanding), 0
+        if followed.baseline.estimates:
+            months, least = followed.baseline.months, followed.baseline.least
+            window = len(dates) if months is None else window_rows(months, least, month)
+            rows = min(window, fold.train.stop - fold.train.start)
+        if late > dates[fold.recent.start]:
+            rows = max(rows, fold.recent.stop - fold.recent.start)
+        found[followed.name] = rows
     if any(baseline(name).estimates for name in anchors.baselines(task.anchor)):
         found["the agent's anchor"] = (anchors.MONTHS + 1) * month  # it decides once a month
     risk = task.written.risk

@@ -44,8 +44,8 @@ def reference(
     if not count:
         return np.zeros(0), ""
     config = run.config
-    known = latest(name, table.dates[: first + 1], config.train, config.expanding)
-    fold = known.complete(table.values)._replace(decisions=slice(first, first + count))
+    fold = latest(name, table.dates[: first + 1], config.train, config.expanding)
+    fold = fold._replace(decisions=slice(first, first + count))
     task = run.any_task.on(table).deciding_at(first)
     replay = Replay(table, [fold], task, config.cap)
     if name not in own:

@@ -13,7 +13,7 @@ from qfolio.portfolio.prices.columns import find_columns
 from qfolio.portfolio.prices.duplicates import check_duplicates
 from qfolio.portfolio.prices.findings import Findings
 from qfolio.portfolio.prices.gaps import cash_outs, complete
-from qfolio.portfolio.prices.grid import arrange
+from qfolio.portfolio.prices.grid import Grid, arrange
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.moves import check_moves
 from qfolio.portfolio.prices.plausibility import FEWEST_ROWS, check_cells, check_size
@@ -74,19 +74,27 @@ class Choices:
         return {name: file for name, file in pairs}
 
 
-def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], Findings]:
-    """The arguments of ``Prices`` (none if the table has errors), and all findings."""
+def cells(table: Table, choices: Choices) -> tuple[Grid | None, Findings]:
+    """The cells by date and asset before gaps are treated (None if rows or columns have errors)."""
     findings = Findings()
     features, shared = tuple(choices.features), choices.own_columns
     columns = find_columns(table, features, shared, choices.date, findings)
     grid = None if columns is None else arrange(table, columns, findings)
     if grid is None:
-        return {}, findings
+        return None, findings
     ordered = not findings.bad
     if choices.returns:
         grid = cumulate(grid, choices.returns, findings)
     check_cells(grid, findings)
     if not ordered or not grid.assets or len(grid.dates) < FEWEST_ROWS:
+        return None, findings
+    return grid, findings
+
+
+def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], Findings]:
+    """The arguments of ``Prices`` (none if the table has errors), and all findings."""
+    grid, findings = cells(table, choices)
+    if grid is None:
         return {}, findings
     delists = choices.ended == "cash-out"
     rest = complete(grid, choices.missing, choices.late, findings, delists=delists)
@@ -98,6 +106,7 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], Findings]:
     check_size(grid, rest, findings)
     if findings.bad:
         return {}, findings
+    features, shared = tuple(choices.features), choices.own_columns
     dates = grid.dates[rest.head :]
     market = np.array(rest.features[:, 0, len(features) :])
     seen = np.array(rest.features[..., : len(features)])

@@ -65,8 +65,8 @@ def read_dates(cells: np.ndarray) -> Dates:
     Accepts dates and times, ISO 8601 and similar texts (2020-01-31, 2020/1/31, 20200131,
     2020-01-31 16:00+01:00), and 31/01/2020 or 01/31/2020 if at least one cell of the column shows
     which number is the day. Time zones are dropped: if all times are midnight in their own zones,
-    the dates are kept; otherwise times are converted to UTC. A column that holds only numbers may
-    count one of ``UNITS``.
+    or each is of another day there, they are kept; otherwise they are converted to UTC. A column
+    that holds only numbers may count one of ``UNITS``.
     """
     import pandas as pd
 
@@ -179,6 +179,8 @@ def _of_calendar(cells: np.ndarray) -> list[datetime | str]:
     moments = [_moment(cell, order) for cell in cells]
     aware = [m for m in moments if isinstance(m, datetime) and m.tzinfo]
     midnight = all(not (m.hour or m.minute or m.second) for m in aware)
+    # The last of daily rows often has the time of the download.
+    local = midnight or len({m.date() for m in aware}) == len(aware)
     read: list[datetime | str] = []
     for cell, moment in zip(cells, moments, strict=True):
         if isinstance(moment, str):
@@ -186,7 +188,7 @@ def _of_calendar(cells: np.ndarray) -> list[datetime | str]:
         elif aware and not midnight and not moment.tzinfo:
             read.append(f"{quote(cell)} has no time zone, other dates have one")
         else:
-            read.append((moment if midnight else moment.astimezone(UTC)).replace(tzinfo=None))
+            read.append((moment if local else moment.astimezone(UTC)).replace(tzinfo=None))
     return read
 
 

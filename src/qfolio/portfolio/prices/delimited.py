@@ -18,7 +18,7 @@ SEPARATORS = ",;\t|"
 LOOKED_AT = 30  # records in which the header is looked for
 
 _DECLARED = re.compile(r'\s*"?sep=([,;\t|])"?[,;\t| ]*\r?\n', re.I)
-_BEFORE, _AFTER = r';[ \t]*"?[-+]?', r'[ \t]*"?[ \t]*(?=[;\r\n]|$)'
+_BEFORE, _AFTER = r'[;\t|] *"?[-+]?', r' *"? *(?=[;\t|\r\n]|$)'
 _POINT = re.compile(
     rf"{_BEFORE}(?:\d*\.(?:\d{{1,2}}|\d{{4,}})|(?:0\d*|\d{{4,}})?\.\d+){_AFTER}", re.A
 )
@@ -62,7 +62,7 @@ def from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set[
     width = max(len(record) for record in (header.names, *records[header.lines :][:1]))
     layout = _Layout(header, separator, blank + header.lines, width)
     table = _parse(text, name, layout, plain, ".")
-    unclear = _unclear_points(text) if separator == ";" else None
+    unclear = None if separator == "," else _unclear_points(text)
     commas, points = _decimals(table, plain)
     if commas > (0 if unclear else points):
         return _parse(text, name, layout, plain, ",")
@@ -161,7 +161,7 @@ def _decimals(table: Table, plain: set[int]) -> tuple[int, int]:
 
 
 def _unclear_points(text: str) -> str | None:
-    """A number such as 1.234 if no point between semicolons can only be a decimal mark."""
+    """A number such as 1.234 if no point between separators can only be a decimal mark."""
     if _POINT.search(text):
         return None
     found = _TWO_READINGS.search(text)

@@ -1,22 +1,29 @@
 """Joins the tables of a folder, such as one file of bars for each asset, into one."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import amount, quote
+from qfolio.portfolio.prices.findings import Findings, day
+from qfolio.portfolio.prices.grid import Grid, check_currency, signs
 from qfolio.portfolio.prices.reading import PARQUET_FILES, TEXT_FILES
 from qfolio.portfolio.prices.vocabulary import kind
 
 
-def join(folder: Path, load: Callable[[Path], Any]) -> Any:
-    """A long data frame of all tables in a folder.
+def join(
+    folder: Path, read: Callable[[Path], tuple[Grid, Findings]], channels: tuple[str, ...]
+) -> tuple[Any, Findings]:
+    """A long data frame of all tables in a folder, and findings, such as the tables' warnings.
 
-    load: function that reads the Prices in one of them. An asset that its file does not name takes
-    the name of the file.
+    Cells that are empty in a table stay empty: what they are depends on the other tables.
+
+    read: gives the cells of one of them. An asset that its file does not name takes the name of the
+    file. channels: names of the grids' features.
 
     Raises:
         QfolioError: A table has errors, or the folder has none.
@@ -27,16 +34,31 @@ def join(folder: Path, load: Callable[[Path], Any]) -> Any:
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in known)
     if not files:
         raise QfolioError(f"{quote(folder, 300)} is a folder without tables (.csv or .parquet).")
-    parts = []
+    parts, findings, currency = [], Findings(), set()
     for file in files:
-        table = load(file)
-        for j, name in enumerate(table.assets):
+        grid, found = read(file)
+        currency |= signs(grid.table, grid.prices.columns)
+        findings += [
+            replace(finding, message=f"in {quote(file.name)}: {finding.message}")
+            for finding in found
+            if finding.severity == "warning"
+        ]
+        for j, name in enumerate(grid.assets):
             columns = {
-                "date": table.dates,
-                "ticker": np.full(len(table), file.stem if kind(name) else name, dtype=object),
-                "close": table.known[:, j],
-                **dict(zip(table.feature_names, table.features[:, j].T, strict=True)),
-                **dict(zip(table.market_names, table.market.T, strict=True)),
+                "date": grid.dates,
+                "ticker": np.full(len(grid.dates), file.stem if kind(name) else name, dtype=object),
+                "close": grid.prices.values[:, j],
             }
-            parts.append(pd.DataFrame(columns).dropna(subset="close"))
-    return pd.concat(parts, ignore_index=True)
+            for channel, block in zip(channels, grid.features, strict=True):
+                columns[channel] = block.values[:, j if block.by_asset else 0]
+            parts.append(pd.DataFrame(columns))
+    check_currency(currency, findings)
+    frame = pd.concat(parts, ignore_index=True)
+    some = frame.iloc[:, 2:].notna().any(axis=1).groupby(frame["date"]).transform("any")
+    if not some.all():
+        empty = np.unique(frame["date"][~some])
+        findings.warn(
+            f"left out: {amount(len(empty), 'row')} without any number; the latest has this date",
+            date=day(empty[-1]),
+        )
+    return frame[some].reset_index(drop=True), findings

@@ -131,9 +131,10 @@ def _treat_gaps(
         for hole, block in zip(_holes(grid, span), grid.features, strict=True)
     ]
     if missing != "drop-asset":
+        earlier = "Give prices from before it was delisted, or remove the asset."
         _report_assets(
             grid, span.empty, lambda j: "there are no prices at all", "without prices",
-            "Remove the asset.", findings,
+            earlier if span.delists else "Remove the asset.", findings,
         )  # fmt: skip
     if missing == "forward-fill":
         if span.gaps.any():

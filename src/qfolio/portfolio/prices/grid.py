@@ -73,14 +73,24 @@ def report_cells(
     findings.others("error", len(spots), block.name, more, advice=advice)
 
 
+def signs(table: Table, prices: Sequence[int]) -> set[str]:
+    """The currency signs in a table's columns of prices."""
+    return set().union(*(currencies(table.columns[j]) for j in prices))
+
+
+def check_currency(found: set[str], findings: Findings) -> None:
+    """Reports currency signs that differ."""
+    if len(found) > 1:
+        findings.error(
+            f"prices are in several currencies: {' and '.join(sorted(found))}",
+            advice=ONE_CURRENCY,
+        )
+
+
 def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
     """The grid of a table; None if it would be far too large."""
     prices = columns.prices
-    if len(signs := sorted(set().union(*(currencies(table.columns[j]) for j in prices)))) > 1:
-        findings.error(
-            f"prices are in several currencies: {' and '.join(signs)}",
-            advice=ONE_CURRENCY,
-        )
+    check_currency(signs(table, prices), findings)
     for j, name in enumerate(table.names):
         if plain(name) == "currency":
             codes = sorted({label(cell) for cell in table.columns[j]} - {""})

@@ -8,7 +8,7 @@ import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,11 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import amount, hint, quote
 from qfolio.portfolio.prices import folder, reading
-from qfolio.portfolio.prices.checks import Choices, examine
+from qfolio.portfolio.prices.checks import Choices, cells, examine
 from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.findings import Finding, Findings, day, listing
 from qfolio.portfolio.prices.frequency import periods_per_year
+from qfolio.portfolio.prices.grid import Grid
 from qfolio.portfolio.prices.members import membership
 from qfolio.portfolio.prices.series import series
 
@@ -29,13 +30,10 @@ DEFAULT_NOTE = (
     "20 US stocks, chosen in hindsight from those still listed in 2022 (survivors): strategies "
     "that hold them look better than they could have been at the time."
 )
-OF_ALL = ("delisting_haircut", "members")
-"""Choices that apply to a whole table, not to each file of a folder."""
-
 CAVEATS = 3
 """Warnings that a table's note has in full."""
 
-DEFAULT_TRIALS = 245
+DEFAULT_TRIALS = 250
 """Earlier trials on the default table, as docs/results/real_prices.md lists them."""
 
 
@@ -316,13 +314,7 @@ def accepted(prices: Prices | None, findings: Sequence[Finding], source: Any) ->
     Raises QfolioError with the errors if it found none.
     """
     if prices is None:
-        errors = [finding for finding in findings if finding.severity == "error"]
-        shown = "; ".join(str(finding) for finding in errors[:2])
-        rest = sum(finding.count for finding in errors[2:])
-        more = f"; and {rest:,} more" if rest else ""
-        advice = " ".join(dict.fromkeys(f.advice for f in errors[:2] if f.advice))
-        label = f"{quote(Path(source).name)}: " if isinstance(source, str | Path) else ""
-        raise QfolioError(f"{label}{shown}{more}.{' ' * bool(advice)}{advice}")
+        raise _refusal(findings, source)
     doubts = [finding for finding in findings if finding.severity == "warning"]
     if source is None or not doubts:  # the default table's have been looked at
         return prices
@@ -330,6 +322,17 @@ def accepted(prices: Prices | None, findings: Sequence[Finding], source: Any) ->
     said = [f"{finding}." for finding in doubts[:CAVEATS]]
     said += [f"And {amount(rest, 'more warning')}."] * bool(rest)
     return replace(prices, note=" ".join([*filter(None, [prices.note]), *said]))
+
+
+def _refusal(findings: Sequence[Finding], source: Any) -> QfolioError:
+    """The errors among the findings on a source."""
+    errors = [finding for finding in findings if finding.severity == "error"]
+    shown = "; ".join(str(finding) for finding in errors[:2])
+    rest = sum(finding.count for finding in errors[2:])
+    more = f"; and {rest:,} more" if rest else ""
+    advice = " ".join(dict.fromkeys(f.advice for f in errors[:2] if f.advice))
+    label = f"{quote(Path(source).name)}: " if isinstance(source, str | Path) else ""
+    return QfolioError(f"{label}{shown}{more}.{' ' * bool(advice)}{advice}")
 
 
 def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Finding]]:
@@ -344,7 +347,7 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
     Raises:
         QfolioError: There is no table to check: no such file, not text, or rows of unequal length.
     """
-    label, note = "", ""
+    label, note, others = "", "", Findings()
     if source is None:
         from skfolio.datasets import load_sp500_dataset
 
@@ -352,15 +355,14 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
     chosen = Choices(**choices)
     if joined := isinstance(source, str | Path) and os.path.isdir(source):
         label = Path(source).resolve().name
-        alone = {name: value for name, value in choices.items() if name not in OF_ALL}
-        alone["columns"] = chosen.own_columns
-        source = folder.join(Path(source), lambda file: load(file, **alone))
+        channels = (*chosen.features, *chosen.own_columns)
+        source, others = folder.join(Path(source), partial(_cells, chosen), channels)
         chosen = replace(chosen, returns=None, date="date")
     table = reading.read(source, lambda names: text_columns(names, chosen.date))
     content, findings = examine(table, chosen)
     if joined:  # its rows are not those of any file
-        findings = Findings(replace(finding, row=None) for finding in findings)
-    if not content:
+        findings = Findings([*(replace(finding, row=None) for finding in findings), *others])
+    if findings.bad or not content:
         return None, findings
     for name, file in chosen.series.items():
         numbers = series(file, name, content["dates"], findings)
@@ -371,6 +373,16 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
     if chosen.members is not None:
         prices = replace(prices, members=membership(chosen.members, prices.dates, prices.assets))
     return prices, findings
+
+
+def _cells(chosen: Choices, file: Path) -> tuple[Grid, Findings]:
+    """The cells of a file of a folder; raises QfolioError with its errors."""
+    grid, findings = cells(
+        reading.read(file, lambda names: text_columns(names, chosen.date)), chosen
+    )
+    if grid is None or findings.bad:
+        raise _refusal(findings, file)
+    return grid, findings
 
 
 def describe(prices: Prices) -> dict[str, Any]:
