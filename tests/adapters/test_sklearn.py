@@ -345,6 +345,14 @@ def test_it_goes_on_learning_day_by_day(agent):
     assert (new > old).all()
     with pytest.raises(ValueError, match="new rows only"):
         by_hand.partial_fit(x[TRAIN + 2 : TRAIN + 5])
+    rows = x[TRAIN + 3 : TRAIN + 6]
+    wrong = rows.copy()
+    wrong.iloc[-1, 0] = -1.0  # too late to learn from, but the next weights depend on it
+    latest = by_hand.policy_
+    with pytest.raises(ValueError, match="must be above -1"):
+        by_hand.partial_fit(wrong)
+    assert by_hand.policy_ is latest
+    assert by_hand.partial_fit(rows).n_samples_seen_ == TRAIN + 6
 
 
 def test_a_fallback_takes_over():

@@ -26,7 +26,7 @@ from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
-from populations import first_member, train_to
+from populations import assert_same, first_member, train_to
 from probes import Aim, AimNumbered, AimPlainWeights, AimWeights, OneState
 
 DISCOUNT = 0.8
@@ -600,6 +600,19 @@ def test_soft_actor_critic_explores_by_noise_that_lasts():
         numbered.init(Pendulum(torques=3), jax.random.key(0))
 
 
+def test_nothing_of_old_episodes_goes_on_with_other_data():
+    """Neither their sums of rewards nor their noise; the scale of rewards is kept."""
+    agent = DDPG(**SMALL, noise_theta=0.2, normalize_rewards=True)
+    old, fresh = (Population(Aim(1.0), agent, [seed, seed + 1]).fetch().agent for seed in (0, 2))
+    more = jax.tree.map(lambda x: x + 5, old.normalizer.rewards)
+    old = eqx.tree_at(lambda s: s.normalizer.rewards, old, more)
+    new = agent.carry_over(old, fresh)
+    assert_same((new.noise, new.replay, new.rewards), (fresh.noise, fresh.replay, fresh.rewards))
+    assert_same(new.learned, old.learned)
+    assert_same(new.normalizer.rewards.returns, np.zeros((2, 4)))
+    assert_same(new.normalizer.rewards.moments, old.normalizer.rewards.moments)
+
+
 def test_warm_up_explores_at_random_and_learning_by_the_actor():
     agent = DDPG(hidden=(8,), num_envs=500, learning_starts=1000, exploration_noise=0.0)
     state = agent.init(Pendulum(torques=0), jax.random.key(0))
@@ -683,6 +696,14 @@ def test_a_spread_that_no_policy_has_is_refused():
         with pytest.raises(QfolioError, match=r"spread is 1\.0; it must be below 1: no"):
             SAC(**SMALL, spread=1.0).init(task, jax.random.key(0))
     SAC(**SMALL, spread=1.0).init(Aim(math.inf), jax.random.key(0))
+
+
+def test_the_spread_of_each_member_is_checked_whatever_ran_before():
+    few, many = SAC(**SMALL, spread=0.5), SAC(**SMALL, spread=5.0)
+    Population(OneState(), few, [0])  # compiles the program of both
+    for agents in ([many], [few, many]):
+        with pytest.raises(QfolioError, match=r"spread is 5\.0; it must be below 1: no"):
+            Population(OneState(), agents, range(len(agents)))
 
 
 @pytest.mark.optimized

@@ -541,6 +541,24 @@ def test_reinforce_learns_from_whole_episodes_alone(time_limit_terminal):
     )
 
 
+def test_sums_of_rewards_do_not_go_on_with_other_data():
+    agent = A2C(hidden=(4,), normalize_rewards=True)
+    fresh = agent.init(Pendulum(), jax.random.key(0))
+    old = eqx.tree_at(lambda s: s.normalizer.rewards.returns, fresh, jnp.ones(8))
+    new = agent.carry_over(old, fresh)
+    assert new.normalizer.rewards is not None
+    np.testing.assert_array_equal(new.normalizer.rewards.returns, np.zeros(8))
+    assert new.weights is old.weights
+
+
+@pytest.mark.parametrize(("horizon", "episode", "length"), [(12, 0, 12), (30, 20, 20)])
+def test_a_rollout_of_reinforce_is_an_episode(horizon, episode, length):
+    agent = REINFORCE(hidden=(4,), num_envs=2, episode_steps=episode)
+    run = train(Pendulum(horizon=horizon), agent, episodes=2)
+    assert (run.agent.rollout_steps, run.episodes) == (length, 2)
+    assert (run.config.agent_settings["rollout_length"], run.done("steps")) == (0, 2 * length)
+
+
 def test_reinforce_wants_whole_episodes():
     with pytest.raises(QfolioError, match="multiple of the 200 steps"):
         REINFORCE(rollout_length=150).init(Pendulum(), jax.random.key(0))

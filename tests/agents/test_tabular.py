@@ -180,6 +180,12 @@ def test_sarsa_after_a_cut():
     assert tables[0, 1, 0] == pytest.approx(10 + 0.1 * (2 + 0.9 * 31 - 10))
 
 
+def test_sarsa_does_not_wait_for_an_action_on_other_data():
+    agent = Sarsa()
+    fresh = jit(agent.init)(Cliff(), jax.random.key(0))
+    assert not agent.carry_over(agent.cut(fresh), fresh).last.truncated.any()
+
+
 def test_double_q_by_hand():
     agent = DoubleQ(discount=0.9, learning_rate=0.1)
     learned = set()

@@ -339,6 +339,25 @@ def test_returns_do_not_reach_from_a_cut_episode_into_a_new_one():
     assert ends(population) == [False, False, False, True, False, True, False, False]
 
 
+def test_what_was_learned_outlives_an_exception_of_an_environment(monkeypatch):
+    """It fails in the second member's fourth step, when both have learned since the last chunk."""
+    agent = dataclasses.replace(SMALL, n_steps=2)
+    population = trained(task(Endless), agent, [0, 1], 6)
+    outcomes = iter([(1.0, False, False)] * 14)
+    monkeypatch.setattr(Endless, "outcome", lambda *args: next(outcomes))
+    with pytest.raises(QfolioError, match="step 2 of an episode: StopIteration"):
+        population.advance(20)
+    kept = population.fetch()
+    assert (kept.steps.tolist(), population.steps) == ([10, 9], 9)
+    assert kept.tally.steps.tolist() == [[0, 0], [0, 0]]
+    monkeypatch.undo()
+    assert population.evaluate(start_keys(3)).returns.tolist() == [[4.0] * 3] * 2
+    population.advance(2)
+    assert population.fetch().steps.tolist() == [12, 11]
+    ends = stored(population).last.reshape(-1, 2)[:12, 0]
+    assert ends.tolist() == [i in (3, 7, 9) for i in range(12)]
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -423,6 +442,19 @@ def test_an_environment_that_is_registered_anew_is_read_anew():
     gymnasium.register("TestAgain-v0", entry_point=Wider, max_episode_steps=9)
     after = GymnasiumTask("TestAgain-v0")
     assert (after.horizon, after.observation[0]) == (9, (3,))
+
+
+def test_an_agent_trains_with_what_is_registered_now():
+    """Programs of equal settings are shared, unless these mean another environment."""
+
+    class More(Endless):
+        action_space = gymnasium.spaces.Discrete(3)
+
+    for kind in (Endless, More):
+        gymnasium.registry.pop("TestShared-v0", None)
+        gymnasium.register("TestShared-v0", entry_point=kind, max_episode_steps=4)
+        population = trained(GymnasiumTask("TestShared-v0"), SMALL, [0], 40)
+        assert set(stored(population).action[:80].tolist()) == set(range(kind.action_space.n))
 
 
 def test_an_agent_that_diverges_is_not_the_environments_fault():

@@ -1,4 +1,5 @@
 import os
+import sys
 
 import equinox as eqx
 import jax
@@ -6,14 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qfolio.agents.a2c import A2C
 from qfolio.agents.dqn import DQN
 from qfolio.agents.ppo import PPO
+from qfolio.core.contract import learning_of
 from qfolio.core.devices import Members, configure
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number
 from qfolio.core.mdp import Step
 from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin, chunk_steps
+from qfolio.portfolio.rewards import Reward
+from qfolio.portfolio.synthetic.kelly import Kelly
 
 from populations import assert_same, stored, train_to
 from probes import Endless, Explosive, RewardDelay
@@ -44,6 +49,31 @@ def test_members_of_another_number_share_programs(task, agent):
     assert_same(large.fetch(), trained(task, agent, range(5), [120])[0].fetch())
     first = jax.tree.map(lambda leaf: leaf[:1], large.fetch())
     assert_same(small.fetch(), first)
+
+
+class Bonus(Reward):
+    value = 1.0
+
+    def __call__(self, state, outcome):
+        return jnp.asarray(self.value), None
+
+
+class Rewarded(Kelly):
+    reward = f"{__name__}:Bonus"
+
+
+def test_a_reward_that_is_defined_again_is_the_one_that_trains(monkeypatch):
+    """Programs of equal settings are shared, unless these mean another class."""
+    task, agent = Rewarded(horizon=5), A2C(hidden=(2,), num_envs=1)
+
+    def one_return():
+        return trained(task, agent, [0], [5])[1][0].returns[0, 4, 0]
+
+    before = learning_of(task, agent)
+    assert one_return() == 5
+    monkeypatch.setattr(sys.modules[__name__], "Bonus", type("Bonus", (Bonus,), {"value": 2.0}))
+    assert one_return() == 10
+    assert learning_of(task, agent) is not before
 
 
 def test_a_rehearsal_compiles_what_a_population_runs(task, agent):

@@ -34,5 +34,5 @@ def test_an_agent_without_a_buffer_learns_at_once():
 def test_what_was_unlearned_has_both_numbers():
     agent = DQN(num_envs=32, learning_starts=2048, replay_capacity=4096)
     assert unlearned(agent, 896).startswith(
-        "learned nothing: it begins after 2,016 environment steps, and a seed had 896."
+        "learns nothing: it begins after 2,016 environment steps, and a seed has 896."
     )

@@ -261,12 +261,12 @@ def test_the_verdict_says_which_way_had_too_few_steps_to_learn(content, tmp_path
     assert result is not None
     found = verdict(result)
     assert (
-        "Renewed learning learned nothing: it begins after 48 environment steps, and a seed had 40."
+        "Renewed learning learns nothing: it begins after 48 environment steps, and a seed has 40."
         in found
     )
     assert "A new agent does not settle" in found
     assert "Going on does not settle" in found
-    assert "learned nothing" not in verdict(content)
+    assert "learns nothing" not in verdict(content)
 
 
 def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):

@@ -16,6 +16,7 @@ from safetensors.numpy import load_file
 import qfolio.core.files
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
+from qfolio.agents.tabular import QLearning
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import write_arrays
 from qfolio.core.text import figure
@@ -23,6 +24,7 @@ from qfolio.experiments.budget import Budget
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.kelly import Kelly
+from qfolio.tasks.finite import Cliff
 
 from listeners import Interrupt, Tell
 from probes import Explosive
@@ -225,6 +227,16 @@ def test_ctrl_c_stops_with_a_checkpoint(task, agent, tmp_path):
     assert run.interrupted
     assert 0 < run.episodes < 24 * 50
     assert Run.open(tmp_path / "run").episodes == run.episodes
+
+
+def test_a_run_that_goes_on_has_the_same_curve_where_episodes_end_early(tmp_path):
+    agent = QLearning(epsilon_decay=0.99)
+    create(Cliff(), agent, tmp_path / "straight", episodes=600).train()
+    stopped = create(Cliff(), agent, tmp_path / "stopped", episodes=600)
+    stopped.train(listeners=[Interrupt(lambda training: training.population.episodes >= 200)])
+    assert 0 < stopped.episodes < 600
+    Run.open(tmp_path / "stopped").train()
+    assert_same(tmp_path / "stopped", tmp_path / "straight")
 
 
 def test_an_infinite_loss_keeps_the_last_good_checkpoint(tmp_path):

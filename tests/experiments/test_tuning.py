@@ -1,5 +1,6 @@
 """Searches so small that they take seconds; what they find does not matter, how they go does."""
 
+import dataclasses
 import json
 import math
 import os
@@ -14,6 +15,7 @@ import pytest
 
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
+from qfolio.agents.sac import SAC
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
@@ -326,6 +328,27 @@ def test_settings_that_the_agent_refuses_together_do_not_end_a_search(tmp_path, 
     ]
     assert len(trials) == 6
     assert refused == [trial for trial in trials if math.isnan(trial.value)] != []
+
+
+def test_a_budget_in_which_nothing_is_learned_is_refused(tmp_path, task, agent):
+    """Four episodes of 25 steps; of two values, one may be too large."""
+    agent = dataclasses.replace(agent, learning_starts=102)
+    says = "^The agent learns nothing: it begins after 100 environment steps, and a seed has 100. "
+    with pytest.raises(QfolioError, match=says):
+        start(tmp_path / "s", task, agent)
+    start(tmp_path / "s", task, agent, "learning_starts=100|102")
+
+
+def test_numbers_that_do_not_fit_the_task(tmp_path):
+    agent, says = (
+        SAC(hidden=(4,), learning_starts=8, batch_size=8),
+        r"spread is 2\.0; it must be below 1",
+    )
+    with pytest.raises(QfolioError, match=says):
+        start(tmp_path / "s", Catch(), agent, "spread=0.1..2")
+    work = start(tmp_path / "s", Catch(), agent, "spread=0.1..0.9")
+    with pytest.raises(QfolioError, match=says):
+        work.configured({"spread": 2.0})
 
 
 class Unpaid(Catch):

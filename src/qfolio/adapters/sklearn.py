@@ -7,6 +7,7 @@
 
 import inspect
 from collections.abc import Mapping
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -201,19 +202,21 @@ class PortfolioPolicy(BaseOptimization):
         if not hasattr(self, "policy_"):
             return self.fit(X, y)
         returns, dates = validate_data(self, X, reset=False, dtype=np.float64), _dates(X)
+        after = copy(self)  # if learning fails, this one is as before
         if dates is None or self.observations_ is None:
-            self.observations_ = None
+            after.observations_ = None
         else:
             if not dates[0] > self.observations_[-1]:
                 raise ValueError(
                     f"X begins at {dates[0]}, but rows up to {self.observations_[-1]} have already "
                     "been learned from; partial_fit takes new rows only."
                 )
-            self.observations_ = self.observations_.append(dates)[-len(self.returns_) :]
-        self.returns_ = np.concatenate([self.returns_, returns])[-len(self.returns_) :]
-        self.n_samples_seen_ += len(returns)
-        self.policy_ = self.policy_.update(self._learned(), self.update_episodes)
-        self.weights_ = self._next_weights()
+            after.observations_ = self.observations_.append(dates)[-len(self.returns_) :]
+        after.returns_ = np.concatenate([self.returns_, returns])[-len(self.returns_) :]
+        after.n_samples_seen_ += len(returns)
+        after.policy_ = self.policy_.update(after._learned(), self.update_episodes)
+        after.weights_ = after._next_weights()
+        self.__dict__.update(vars(after))
         return self
 
     def predict(self, X: Any) -> Any:

@@ -285,7 +285,9 @@ class ActorCritic(Agent, Generic[L]):
         )
 
     def carry_over(self, state: State, fresh: State) -> State:
-        return eqx.tree_at(lambda s: (s.replay, s.rewards), state, (fresh.replay, fresh.rewards))
+        where: Any = lambda s: (s.replay, s.rewards, s.noise, s.normalizer)  # noqa: E731
+        parts = (fresh.replay, fresh.rewards, fresh.noise, state.normalizer.cut())
+        return eqx.tree_at(where, state, parts, is_leaf=lambda x: x is None)
 
     def weights(self, state: ActorCriticState[L]) -> PyTree:
         return state.normalizer.attached(state.learned.actor)

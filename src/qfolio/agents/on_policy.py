@@ -106,8 +106,10 @@ class OnPolicy(Agent):
     _schedule = Group(CosineSchedule)
     _optimizer = Group(OptimizerConfig)
 
+    least_length = 1  # of a rollout
+
     def __check_init__(self) -> None:
-        require_counts(self, "rollout_length")
+        require_counts(self, "rollout_length", self.least_length)
         require(self, "discount", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
         coefficients = "value_coef entropy_coef saturation_penalty"
@@ -240,6 +242,9 @@ class OnPolicy(Agent):
 
     def cut(self, state: OnPolicyState) -> OnPolicyState:
         return dataclasses.replace(state, normalizer=state.normalizer.cut())
+
+    def carry_over(self, state: OnPolicyState, fresh: OnPolicyState) -> OnPolicyState:
+        return self.cut(state)
 
     def descend(
         self, task: Task, state: OnPolicyState, batch: Batch

@@ -8,6 +8,8 @@ exception: the baseline replaces the rewards that a time limit cuts off, unless
 from the paper.
 """
 
+import dataclasses
+
 from jax import lax
 from jaxtyping import Array, Bool, PRNGKeyArray
 
@@ -21,7 +23,18 @@ from qfolio.core.training import episode_steps
 class REINFORCE(OnPolicy):
     """REINFORCE with a learned baseline."""
 
-    rollout_length: int = static(200)  # steps learned from at once: whole episodes
+    rollout_length: int = static(0)  # steps learned from at once: whole episodes; 0: one of them
+
+    least_length = 0
+
+    @property
+    def rollout_steps(self) -> int:
+        return self.rollout_length or 1  # not fitted to a task yet
+
+    def fitted(self, task: Task) -> "REINFORCE":
+        if self.rollout_length:
+            return self
+        return dataclasses.replace(self, rollout_length=episode_steps(task, self))
 
     def init(self, task: Task, key: PRNGKeyArray) -> OnPolicyState:
         episode = episode_steps(task, self)

@@ -140,10 +140,14 @@ class SAC(ActorCritic[Learned]):
                 f"noise_theta is {self.noise_theta}, for continuous actions, but those of "
                 f"{task.name} are numbered; set noise_theta=1."
             )
+        self.fitted(task)
+        return super().init(task, key)
+
+    def fitted(self, task: Task) -> "SAC":
         if not isinstance(task.actions, Box) or math.isfinite(task.actions.bound):
             wanted = f"below 1: no actions of {task.name} are more random than uniform ones"
             require(self, "spread", lambda x: x < 1, wanted)
-        return super().init(task, key)
+        return self
 
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
         actor_key, critic_key = jax.random.split(key)

@@ -240,3 +240,6 @@ class Sarsa(Tabular):
 
     def cut(self, state: SarsaState) -> SarsaState:
         return eqx.tree_at(lambda s: s.last.truncated, state, jnp.ones(self.num_envs, bool))
+
+    def carry_over(self, state: SarsaState, fresh: SarsaState) -> SarsaState:
+        return eqx.tree_at(lambda s: s.last, state, fresh.last)

@@ -112,11 +112,11 @@ def learning_of(task: Task, agent: Agent) -> Callable[..., Any]:
     program that trains share one trace, if the types of the arguments agree. A constant has another
     type there than what is computed from arguments, see ``_here``.
     """
-    return _learning_of(jax.tree.structure((task, agent)))
+    return _learning_of(jax.tree.structure((task, agent)), task.referents)
 
 
 @lru_cache(maxsize=8)
-def _learning_of(_structure: Hashable) -> Callable[..., Any]:
+def _learning_of(_structure: Hashable, _referents: Hashable) -> Callable[..., Any]:
     def learn(task: Task, agent: Agent, state: Any, rollout: Any, key: PRNGKeyArray) -> Any:
         return _arrays(agent, "learn", agent.learn(task, state, rollout, key))
 

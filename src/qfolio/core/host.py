@@ -71,6 +71,11 @@ class HostTask(Task):
     def observation(self) -> tuple[tuple[int, ...], type]:
         """Shape and type of an observation."""
 
+    @property
+    def referents(self) -> Hashable:
+        """What programs know of the environment: another one may be registered with its ID."""
+        return self.observation, self.states, self.observation_scale, self.actions
+
     @abc.abstractmethod
     def make(self, **options: Any) -> Any:
         """A new environment without a time limit; ``options`` are arguments of its constructor."""
@@ -178,7 +183,8 @@ def _close(environments: Iterable[Any]) -> None:
 class HostPopulation(Population):
     """A population whose task is stepped from Python.
 
-    After ``restore`` agents keep what they learned, but environments start new episodes.
+    After ``restore``, and after an exception of an environment, agents keep what they learned, but
+    environments start new episodes.
     """
 
     starts, curve_starts = 100, 10
@@ -204,11 +210,9 @@ class HostPopulation(Population):
         return len(self.seeds)
 
     def restore(self, state: TrainingState) -> None:
-        tally = jax.tree.map(np.zeros_like, state.tally)
-        state = eqx.tree_at(lambda s: s.tally, state, tally)
         each = range(len(self.seeds))
         self._states = [jax.device_put(jax.tree.map(lambda x, i=i: x[i], state)) for i in each]
-        self._environments = []
+        self._leave_episodes()
 
     def advance(self, steps: int, *, strict: bool = True) -> Episodes:
         if not self._environments:
@@ -217,7 +221,11 @@ class HostPopulation(Population):
                 self._cut()
         steps, learning = self._plan(steps, self._rows)
         players = [self._play(member, steps, learning) for member in range(len(self.seeds))]
-        records = _stack(_take_turns(players))
+        try:
+            records = _stack(_take_turns(players))
+        except BaseException:
+            self._leave_episodes()
+            raise
         if strict:
             self._require_healthy()
         return records
@@ -238,6 +246,14 @@ class HostPopulation(Population):
         judged = _take_turns([self._judge(member, seeds) for member in range(len(self.seeds))])
         unknown: Any = np.full(len(self.seeds), np.nan)
         return Greedy(_stack(judged), unknown)
+
+    def _leave_episodes(self) -> None:
+        """Lets the next step begin new episodes, in new environments."""
+        self._environments = []
+        self._states = [
+            eqx.tree_at(lambda s: s.tally, state, jax.tree.map(jnp.zeros_like, state.tally))
+            for state in self._states
+        ]
 
     def _cut(self) -> None:
         """Tells the agents that their episodes were cut off."""
@@ -278,27 +294,32 @@ class HostPopulation(Population):
             return carry, act(task, agent, carry, seen, jnp.int32(0))
 
         actions = self._start("act", act, carry, own, environments.observation, np.int32(0))
-        for row in range(0, steps, length):
-            rollout = []
-            for time in range(1, length + 1):
-                yield
-                seen, action = environments.observation, np.asarray(actions)
-                outcome = environments.step(action)
-                rollout.append((seen, action, *outcome))
-                environments.restart(outcome.terminated | outcome.truncated)
-                seen = environments.observation
-                if time < length:
-                    actions = self._start("act", act, carry, own, seen, np.int32(time))
-            before, action, *outcomes = map(_stack_rows, zip(*rollout, strict=True))
-            reward, after, terminated, truncated = outcomes
-            transition = Transition((), before, action, reward, (), after, terminated, truncated)
-            inputs = transition, seen, np.int32(row)
-            carry, actions = self._start(name, learn, carry, own, *inputs, donate=True)
+        try:
+            for row in range(0, steps, length):
+                rollout = []
+                for time in range(1, length + 1):
+                    yield
+                    seen, action = environments.observation, np.asarray(actions)
+                    outcome = environments.step(action)
+                    rollout.append((seen, action, *outcome))
+                    environments.restart(outcome.terminated | outcome.truncated)
+                    seen = environments.observation
+                    if time < length:
+                        actions = self._start("act", act, carry, own, seen, np.int32(time))
+                before, action, *outcomes = map(_stack_rows, zip(*rollout, strict=True))
+                reward, after, terminated, truncated = outcomes
+                transition = Transition(
+                    (), before, action, reward, (), after, terminated, truncated
+                )
+                inputs = transition, seen, np.int32(row)
+                carry, actions = self._start(name, learn, carry, own, *inputs, donate=True)
+        finally:  # also after an exception: the state at the beginning has been donated
+            state, records = jax.tree.unflatten(form, carry)
+            self._states[member] = state
 
         def check(task: Task, agent: Agent, state: TrainingState) -> Array:
             return healthy(agent, state)
 
-        state, records = jax.tree.unflatten(form, carry)
         fine = self._start("healthy", check, state, own)
         self._states[member] = eqx.tree_at(lambda s: s.healthy, state, fine)
         return records
@@ -368,11 +389,15 @@ def _stack_rows(rows: Sequence[np.ndarray]) -> Any:
 def _take_turns(players: Sequence[Generator[None, None, T]]) -> list[T]:
     """Resumes the players in turn until all have returned."""
     results: dict[int, T] = {}
-    while len(results) < len(players):
-        for i, player in enumerate(players):
-            if i not in results:
-                try:
-                    next(player)
-                except StopIteration as end:
-                    results[i] = end.value
+    try:
+        while len(results) < len(players):
+            for i, player in enumerate(players):
+                if i not in results:
+                    try:
+                        next(player)
+                    except StopIteration as end:
+                        results[i] = end.value
+    finally:
+        for player in players:
+            player.close()  # if another has failed
     return [results[i] for i in range(len(players))]

@@ -7,7 +7,7 @@ interfaces of this file.
 
 import abc
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
@@ -145,6 +145,14 @@ class Task(eqx.Module):
     def name(self) -> str:
         """The name of the task in messages."""
         return type(self).__name__
+
+    @property
+    def referents(self) -> Hashable:
+        """What its settings refer to by name (default: nothing).
+
+        Programs are compiled anew if it differs, as after a class has been defined again.
+        """
+        return ()
 
     @abc.abstractmethod
     def reset(self, key: PRNGKeyArray) -> PyTree:
@@ -314,6 +322,14 @@ class Agent(eqx.Module):
     def init(self, task: Task, key: PRNGKeyArray) -> Any:
         """The state before any experience."""
 
+    def fitted(self, task: Task) -> "Agent":
+        """This agent with the settings that follow from a task (default: none do).
+
+        Raises QfolioError if a number does not fit the task. ``init`` may not see it, because
+        numbers are inputs of programs.
+        """
+        return self
+
     def warm_up(self) -> int:
         """Steps of each environment that are only observed before learning starts (default: 0)."""
         return 0
@@ -355,8 +371,8 @@ class Agent(eqx.Module):
     def carry_over(self, state: Any, fresh: Any) -> Any:
         """The state with which learning continues on other data (default: ``state``).
 
-        It keeps the learned weights and drops stored experience. fresh: a state before any
-        experience, with the same settings.
+        It keeps the learned weights, drops stored experience, and begins new episodes. fresh: a
+        state before any experience, with the same settings. Both may have a leading member axis.
         """
         return state
 

@@ -47,6 +47,7 @@ class Population:
         self.seeds, self._room = list(seeds), room
         tasks = [tasks] * len(self.seeds) if isinstance(tasks, Task) else list(tasks)
         agents = [agents] * len(self.seeds) if isinstance(agents, Agent) else list(agents)
+        agents = [agent.fitted(task) for task, agent in zip(tasks, agents, strict=True)]
         if len({jax.tree.structure(agent) for agent in agents}) > 1:
             raise QfolioError(
                 "members of one population must share all settings that shape the program; train "
@@ -57,7 +58,7 @@ class Population:
         self._tail = max(tail_steps(agent.discount) for agent in agents)
         self.seconds_compile = 0.0
         own, self._shared, self._join, form = _split(list(zip(tasks, agents, strict=True)))
-        self._begin(own, form)
+        self._begin(own, (form, self.task.referents))
 
     def _require_memory(self) -> None:
         """Raises QfolioError if memory is too small for a form that has not been run before."""
@@ -71,7 +72,10 @@ class Population:
         return self._members.slots
 
     def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
-        """Sets up the members before their first step; ``own`` and ``form`` are from ``_split``."""
+        """Sets up the members before their first step; ``own`` is from ``_split``.
+
+        form: everything about tasks and agents that a compiled program depends on.
+        """
         self._members = Members(len(self.seeds), self._room)
         self._own = self._members.place(own)
         # The key holds everything that a compiled program depends on.
@@ -85,8 +89,8 @@ class Population:
 
     @property
     def steps(self) -> int:
-        """Steps of each environment so far."""
-        return int(self._fetch(lambda state: state.steps)[0])
+        """Steps of each environment so far; after an exception, of the member with the fewest."""
+        return int(self._fetch(lambda state: state.steps).min())
 
     @property
     def member_episodes(self) -> list[int]:

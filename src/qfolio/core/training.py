@@ -59,6 +59,7 @@ def begin(task: Task, agent: Agent, seed: UInt32[Array, ""]) -> TrainingState:
 
     Raises QfolioError if a method of the task or the agent does not return what it has to.
     """
+    agent = agent.fitted(task)
     agent_key, task_key, key = jax.random.split(jax.random.key(seed), 3)
     step = require_task(task, task_key)
     require_methods(type(agent), Agent)

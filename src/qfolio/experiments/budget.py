@@ -48,6 +48,13 @@ class Budget:
 
         return self.amount * (episode_steps(task, agent) if self.steps is None else 1)
 
+    def longest(self, task: "Task", agent: "Agent") -> int:
+        """Steps of each environment, if no episode ends early."""
+        from qfolio.core.training import episode_steps
+
+        rounds = -(-self.amount // agent.num_envs)
+        return rounds * (episode_steps(task, agent) if self.steps is None else 1)
+
     def to_json(self) -> dict[str, int]:
         """``{"episodes": n}`` or ``{"steps": n}``."""
         return {self.unit: self.amount}
@@ -70,7 +77,7 @@ def require_budget(value: object) -> Budget:
 
 
 def unlearned(agent: "Agent", steps: int) -> str:
-    """Why an agent learned nothing in ``steps`` steps of all its environments; empty if it did.
+    """Why an agent learns nothing in ``steps`` steps of all its environments; empty if it does.
 
     The verb and the rest of a sentence whose subject is the agent.
     """
@@ -78,7 +85,7 @@ def unlearned(agent: "Agent", steps: int) -> str:
     if steps > stored:
         return ""
     return (
-        f"learned nothing: it begins after {stored:,} environment steps, and a seed had {steps:,}. "
+        f"learns nothing: it begins after {stored:,} environment steps, and a seed has {steps:,}. "
         "Give it more episodes or steps, or lower learning_starts."
     )
 

@@ -50,8 +50,9 @@ class Seeds:
         self, task: Task, agent: Agent, config: RunConfig, folder: RunFolder | None, room: int = 0
     ) -> None:
         """room: seeds of the largest run that shares the programs, if more than this run's."""
-        self.task, self.agent, self.config, self._folder = task, agent, config, folder
+        self.task, self.config, self._folder = task, config, folder
         self.population: Population = population_of(task, agent, config.seed_range, room)
+        self.agent = self.population.agent  # fitted to the task
         self._metrics: list[Records] = []  # of each chunk
         self.evaluations = Records()
         self.seconds_train = 0.0
@@ -215,8 +216,8 @@ class _Curve(Listener):
         self.seeds = seeds
 
     def on_start(self, training: Training) -> None:
-        # In steps since the run's start, so that a resumed run has the same curve.
-        self.every = (training.begun + training.left) / EVALUATIONS
+        # From the budget alone, so that a resumed run has the same curve if episodes end early.
+        self.every = training.budget.longest(self.seeds.task, self.seeds.agent) / EVALUATIONS
         self.points = training.begun // self.every
         if not training.begun:
             self.seeds.evaluate()

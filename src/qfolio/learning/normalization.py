@@ -96,8 +96,8 @@ class Normalizer(eqx.Module):
         """The statistics with sums of rewards that start again, as at the end of all episodes."""
         if self.rewards is None:
             return self
-        rewards = RewardScale(jnp.zeros_like(self.rewards.returns), self.rewards.moments)
-        return Normalizer(self.observations, rewards)
+        zeros: Any = jnp.zeros_like(self.rewards.returns)
+        return eqx.tree_at(lambda s: s.rewards.returns, self, zeros)
 
     def observation(self, observation: PyTree) -> PyTree:
         """Observations, normalized if the agent does so."""

@@ -8,6 +8,7 @@ the holding. Costs are in ``costs.py``, the same for training and backtest; feas
 
 import abc
 import dataclasses
+from collections.abc import Hashable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -160,6 +161,10 @@ class Market(ExogenousTask):
     @property
     def reward_function(self) -> Reward:
         return _part(self, "reward", self.reward)
+
+    @property
+    def referents(self) -> Hashable:
+        return type(self.costs), type(self.reward_function)
 
     @property
     def path_dependent(self) -> bool:

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import pickle
 import random
 import signal
 import socket
@@ -21,6 +22,7 @@ from qfolio.experiments.budget import Budget
 from qfolio.experiments.executor import Executor, Job
 from qfolio.experiments.machines import dispatch, rays
 from qfolio.experiments.machines.choice import on
+from qfolio.experiments.machines.messages import Lost, Ready
 from qfolio.experiments.machines.rays import Ray
 from qfolio.experiments.machines.schedule import ATTEMPTS
 from qfolio.experiments.run import Run
@@ -76,6 +78,22 @@ def test_a_head_that_is_slow_is_asked_again(errors, calls, why, monkeypatch):
         with pytest.raises(QfolioError, match=rf"ray://x:1 cannot be reached \({why}\)"):
             rays._connected("ray://x:1")
     assert init.call_count == calls
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_it_is_known_whether_a_lost_worker_may_have_begun_its_job(begun, monkeypatch):
+    """One that died idle is noticed only when it is sent a job."""
+    nothing, dead = pickle.dumps([]), ConnectionError("its node has died")
+    answers = [nothing, pickle.dumps([Ready("x", {})]), *[nothing] * begun, dead]
+    fake = Mock(wait=lambda awaited, **_: (awaited, []), get=Mock(side_effect=answers))
+    fake.exceptions.RayError = ConnectionError
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    actors = rays._Actors(Mock(spec=Ray, workers=1, waits=True, devices=1, cpus=1, lockstep=False))
+    actors.start(0)
+    heard = [said for _ in range(2) for _, said in actors.receive(0.0)]
+    actors.send(0, Add("a", 1.0))
+    heard += [said for _ in range(1 + begun) for _, said in actors.receive(0.0)]
+    assert heard == [Ready("x", {}), Lost("its node has died", begun)]
 
 
 class Nodes:

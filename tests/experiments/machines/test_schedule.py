@@ -61,6 +61,14 @@ def test_a_job_that_ends_every_worker_is_given_up():
         schedule.lose(9, "SIGKILL")
 
 
+def test_a_job_is_not_to_blame_for_workers_that_had_not_begun_it():
+    schedule = Schedule([Job("a")])
+    for worker in range(2 * ATTEMPTS):
+        assert given(schedule, worker) == "a"
+        assert schedule.lose(worker, "its node has died", begun=False)
+    assert given(schedule, 9) == "a"
+
+
 def test_a_place_where_no_worker_starts_is_left():
     schedule = Schedule([Job("a")])
     assert [schedule.lose(0, "") for _ in range(ATTEMPTS)] == [True, True, False]

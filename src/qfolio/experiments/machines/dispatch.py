@@ -155,7 +155,7 @@ def drive(
             elif isinstance(said, Lost):
                 if worker in idle:
                     idle.remove(worker)
-                if schedule.lose(worker, said.why):
+                if schedule.lose(worker, said.why, said.begun):
                     workers.start(worker)
                 else:
                     there.remove(worker)

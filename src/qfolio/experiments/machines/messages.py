@@ -46,9 +46,10 @@ class Failed(NamedTuple):
 
 
 class Lost(NamedTuple):
-    """A worker is lost; why: the cause in a few words."""
+    """A worker is lost."""
 
-    why: str
+    why: str  # in a few words
+    begun: bool = True  # whether it may have begun the job that it was given
 
 
 Message = Ready | Report | Done | Failed | Lost

@@ -98,6 +98,7 @@ class _Actors:
         self._stored: dict[str, Any] = {}  # references to arrays in the cluster's store
         self._actors: dict[int, Any] = {}
         self._answers: dict[Any, int] = {}  # awaited answers, with their workers
+        self._taking = set[int]()  # workers that have been sent a job, and may have died before
 
     def start(self, worker: int) -> None:
         self._actors[worker] = self._actor.remote(self._environment)
@@ -109,8 +110,8 @@ class _Actors:
             if digest not in self._stored:
                 self._stored[digest] = self._ray.put(self._packer.arrays[digest])
         arrays = {digest: self._stored[digest] for digest in parcel.arrays}
-        self._actors[worker].begin.remote(pickle.dumps(parcel), arrays)
-        self._listen(worker)
+        self._answers[self._actors[worker].take.remote(pickle.dumps(parcel), arrays)] = worker
+        self._taking.add(worker)
 
     def receive(self, seconds: float) -> list[tuple[int, Message]]:
         awaited = list(self._answers)
@@ -128,9 +129,14 @@ class _Actors:
             try:
                 said: list[Message] = pickle.loads(self._ray.get(answer))
             except self._ray.exceptions.RayError as error:
-                said = [Lost(_reason(error))]
+                said = [Lost(_reason(error), begun=worker not in self._taking)]
+                self._taking.discard(worker)
                 self._ray.kill(self._actors.pop(worker))
-            if not said:
+            if not said and worker in self._taking:
+                self._taking.remove(worker)
+                self._actors[worker].begin.remote()
+                self._listen(worker)
+            elif not said:
                 self._placed = True
                 self._answers[self._actors[worker].ready.remote()] = worker
             elif isinstance(said[-1], Report):

@@ -57,16 +57,17 @@ class Schedule(Generic[R]):
         """Records that a worker has finished its job; returns the job."""
         return self._running.pop(worker)
 
-    def lose(self, worker: int, why: str) -> bool:
+    def lose(self, worker: int, why: str, begun: bool = True) -> bool:
         """Records that a worker is lost; returns whether to start another in its place.
 
-        Raises QfolioError if its job has lost too many workers.
+        Raises QfolioError if its job has lost too many workers. begun: whether the worker may have
+        begun the job; otherwise the job is not to blame.
         """
         job = self._running.pop(worker, None)
         if job is None:
             self._failed_starts[worker] += 1
             return self._failed_starts[worker] < ATTEMPTS
-        self._losses[job.name] += 1
+        self._losses[job.name] += begun
         if self._losses[job.name] == ATTEMPTS:
             raise QfolioError(
                 f"{job.name} was given up, because {ATTEMPTS} workers ended while they ran it "

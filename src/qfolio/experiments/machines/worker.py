@@ -88,6 +88,7 @@ class Actor:
 
     def __init__(self, environment: dict[str, str]) -> None:
         self._environment, self._said = environment, SimpleQueue[Message]()
+        self._taken: tuple[Any, ...] = ()  # the arguments of ``_run``
 
     def placed(self) -> bytes:
         """No messages; answered as soon as the actor has a place in the cluster."""
@@ -100,9 +101,14 @@ class Actor:
         self._unpacker = Unpacker()
         return pickle.dumps([ready])
 
-    def begin(self, parcel: bytes, arrays: dict[str, Any]) -> None:
-        """Begins a job in the background; arrays: references to the arrays that it needs."""
-        threading.Thread(target=self._run, args=(pickle.loads(parcel), arrays)).start()
+    def take(self, parcel: bytes, arrays: dict[str, Any]) -> bytes:
+        """Takes a job; arrays: references to the arrays that it needs. Answers no messages."""
+        self._taken = pickle.loads(parcel), arrays
+        return pickle.dumps([])
+
+    def begin(self) -> None:
+        """Begins the job that was taken, in the background."""
+        threading.Thread(target=self._run, args=self._taken).start()
 
     def listen(self) -> bytes:
         """The messages so far, as bytes; waits until there is one."""

@@ -29,7 +29,7 @@ from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.text import finite
 from qfolio.core.training import begin
-from qfolio.experiments.budget import Budget, seed_range
+from qfolio.experiments.budget import Budget, seed_range, unlearned
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Job, carry_out, persistent
 from qfolio.experiments.fit import Listener, Training
@@ -168,6 +168,9 @@ class Tuning:
             fresh_seeds: Number of seeds of the final comparison, which the search never uses.
             preset: The name of the preset, for readers.
             out: A new or empty folder.
+
+        Raises:
+            QfolioError: A setting is out of range, or the budget ends before learning begins.
         """
         _require_counts(trials=trials, batch=batch, seeds=seeds, fresh_seeds=fresh_seeds)
         config = SearchConfig(
@@ -182,7 +185,9 @@ class Tuning:
             fresh_seeds=fresh_seeds,
             **devices.circumstances("jax", "optuna"),
         )
-        search.require_buildable(type(agent), settings.describe(agent), space)
+        agents = search.require_buildable(agent, task, space)
+        if all(reasons := [_unlearned(one, task, budget) for one in agents]):
+            raise QfolioError(f"The agent {reasons[0]}")
         jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))  # fits the task?
         folder = path_of("out", out)
         with new_folder(folder, "--join") as unfinished:
@@ -209,9 +214,13 @@ class Tuning:
         return cls(config, folder)
 
     def configured(self, values: dict[str, Value]) -> Agent:
-        """The agent with these values of the searched settings."""
+        """The agent with these values of the searched settings.
+
+        Raises QfolioError if it refuses them.
+        """
         described = settings.describe(self.agent)
-        return settings.build(type(self.agent), {**described, **values})
+        agent: Agent = settings.build(type(self.agent), {**described, **values})
+        return agent.fitted(self.task)
 
     def run(
         self,
@@ -388,6 +397,11 @@ class Tuning:
 def _name(asked: Asked) -> str:
     """The name of a trial, counted from 1 as in the report."""
     return f"trial {asked.trial.number + 1}"
+
+
+def _unlearned(agent: Agent, task: Task, budget: Budget) -> str:
+    steps = agent.whole_rollouts(budget.longest(task, agent))
+    return unlearned(agent, steps * agent.num_envs)
 
 
 def _require_counts(**counts: int) -> None:

@@ -5,7 +5,7 @@ import itertools
 import math
 import typing
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from qfolio.core.errors import QfolioError
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
 
-    from qfolio.core.mdp import Agent
+    from qfolio.core.mdp import Agent, Task
 
 Value = float | str
 """Value of a searched setting: a number, or a choice as text."""
@@ -201,17 +201,16 @@ def numbers(kind: type["Agent"]) -> list[str]:
     return [f.name for f in fields if hints[f.name] is float and not f.metadata.get("static")]
 
 
-def require_buildable(
-    kind: type["Agent"], base: Mapping[str, Any], space: Sequence[Dimension]
-) -> None:
-    """Raises QfolioError if an end of a range or a choice is not a valid setting."""
+def require_buildable(agent: "Agent", task: "Task", space: Sequence[Dimension]) -> list["Agent"]:
+    """An agent of each program; raises QfolioError if an end of a range or a choice is invalid."""
+    kind, base = type(agent), settings.describe(agent)
     if not space:
         raise QfolioError(
             f"{kind.__name__} has no setting that is searched by default; name some with --search."
         )
     for dim in space:
         for value in dim.choices or (dim.low, dim.high):
-            settings.build(kind, {**base, dim.name: value})
+            settings.build(kind, {**base, dim.name: value}).fitted(task)
     shaping = [dim for dim in space if dim.choices and dim.name not in numbers(kind)]
     programs = math.prod(len(dim.choices) for dim in shaping)
     if programs > PROGRAMS:
@@ -219,9 +218,10 @@ def require_buildable(
             f"{' × '.join(dim.name for dim in shaping)} make {programs} programs to compile; give "
             f"fewer choices, at most {PROGRAMS} combinations."
         )
-    for choices in itertools.product(*(dim.choices for dim in shaping)):
-        chosen = {dim.name: choice for dim, choice in zip(shaping, choices, strict=True)}
-        settings.build(kind, {**base, **chosen})
+    names = [dim.name for dim in shaping]
+    every = itertools.product(*(dim.choices for dim in shaping))
+    built = (settings.build(kind, base | dict(zip(names, each, strict=True))) for each in every)
+    return [agent.fitted(task) for agent in built]
 
 
 def own_value(agent: "Agent", dim: Dimension) -> Value:
