@@ -28,7 +28,7 @@ from qfolio.core.mdp import Box, Discrete, ExogenousTask, Metrics, Simplex, Task
 from qfolio.learning import optimizer
 from qfolio.learning.evidence import Evidence, EvidenceConfig, blocks_of, left_out
 from qfolio.learning.scores import NETWORKS, Attention, Hidden
-from qfolio.learning.trading import BAND, RATE, Trading, ratio
+from qfolio.learning.trading import Trading, ratio
 
 LARGEST = 3.0
 """Inputs are clipped to ± this many standard deviations of the training data."""
@@ -120,7 +120,7 @@ class TiltPolicy(eqx.Module):
     @property
     def resting(self) -> Trading:
         """The anchor's: a band, moved by the speed towards what was learned for it."""
-        return Trading.start(RATE, BAND).towards(self.members.resting, self.speed)
+        return Trading.resting().towards(self.members.resting, self.speed)
 
 
 def tilted(
@@ -277,15 +277,15 @@ class Tilts(Onlooker):
             return mean(rewards) - self.tracking_aversion / 2 * variance
 
         one = lambda trading: (jax.tree.map(lambda x: x[None], trading),)  # noqa: E731
-        (kept,) = self._paths(task, rollout, one(Trading.start(RATE, BAND)), (None,))
+        (kept,) = self._paths(task, rollout, one(Trading.resting()), (None,))
 
         def loss(members: Tilt) -> tuple[Array, tuple[Array, list[Array]]]:
             scores, share = self._scores(members, task, rollout), state.policy.share
             (rested,) = self._paths(task, rollout, one(members.resting), (None,))
             (rewards,) = self._paths(task, rollout, (members.trading,), (scores,))
-            sooner = lax.stop_gradient(rested) - kept
-            anchored = kept + state.policy.speed * sooner
-            active = [rewards - anchored, sooner]
+            of_speed = lax.stop_gradient(rested) - kept
+            anchored = kept + state.policy.speed * of_speed
+            active = [rewards - anchored, of_speed]
             total = utility(rewards, active[0], seen)
             if members.deep is not None:
                 # On top of the policy as far as it is followed, and from some of the paths.
@@ -309,12 +309,12 @@ class Tilts(Onlooker):
         of_depth = state.evidence_of_depth
         if members.deep is not None:
             of_depth = of_depth.add(some(block), active[2], jax.vmap(some)(unseen), self.memory)
-        # Two numbers, learned from all blocks, can hardly fit noise.
+        # In sample: two numbers hardly overfit.
         of_speed = state.evidence_of_speed.add(block, active[1], counted[None], self.memory)
-        every = evidence, of_depth, of_speed
-        share, depth, speed = (found.share(self.threshold) for found in every)
+        found = evidence, of_depth, of_speed
+        share, depth, speed = (each.share(self.threshold) for each in found)
         policy = TiltPolicy(members, share, depth, speed, state.policy.actions)
-        return TiltsState(policy, adam, *every), {"loss": -gained}
+        return TiltsState(policy, adam, *found), {"loss": -gained}
 
     def _scores(
         self, members: Tilt | Deep, task: ExogenousTask, rollout: Transition

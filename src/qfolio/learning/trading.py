@@ -14,7 +14,8 @@ RATE = 0.3
 
 BAND = 0.2
 """How far a weight may drift from an anchor before it is traded, in units of the equal weight: a
-fifth, as Daryanani (2008) found for portfolios that are rebalanced."""
+fifth, as Daryanani (2008) found for portfolios that are rebalanced. Without a band, an agent that
+stays at its anchor pays for trades at every row."""
 
 
 class Trading(eqx.Module):
@@ -25,8 +26,16 @@ class Trading(eqx.Module):
 
     @staticmethod
     def start(rate: float = RATE, band: float = 0.05) -> "Trading":
-        """Trades the share ``rate`` at each step, outside a band in units of the equal weight."""
+        """What learning starts from.
+
+        rate: share of the way. band: in units of the equal weight (default: 5%).
+        """
         return Trading(jnp.array(math.log(rate / (1 - rate))), jnp.array(math.log(band)))
+
+    @staticmethod
+    def resting() -> "Trading":
+        """What keeps a portfolio near an anchor: ``RATE``, outside ``BAND``."""
+        return Trading.start(RATE, BAND)
 
     @property
     def described(self) -> dict[str, Array]:

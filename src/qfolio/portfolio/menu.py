@@ -11,7 +11,7 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import MenuActions
 from qfolio.core.mdp import Discrete
-from qfolio.learning.trading import BAND, RATE, Trading, ratio
+from qfolio.learning.trading import RATE, Trading, ratio
 
 MOST = 2000
 """Largest number of allocations of a menu."""
@@ -109,9 +109,8 @@ class Menu(eqx.Module):
         kept = (1 - RATE) * (1 + ratio(jnp.minimum(idle, 0.0), assets.sum()))
         bought = RATE + (1 - RATE) * ratio(jnp.maximum(idle, 0.0), anchor.sum())
         towards = simplex.with_rest(kept * assets + bought * target[1:])
-        # Without a band, an agent that stays at the anchor pays for trades at every row.
-        trading = Trading.start(RATE, BAND)
-        return jnp.where(choice == 0, trading(assets, simplex.with_rest(anchor), anchor), towards)
+        stay = Trading.resting()(assets, simplex.with_rest(anchor), anchor)
+        return jnp.where(choice == 0, stay, towards)
 
     @staticmethod
     def tilted(signalled: Signalled, tilt: Float[Array, " signal"]) -> Float[Array, " entry"]:

@@ -229,6 +229,7 @@ def test_what_is_bought_once_is_bought_whole(trading, calendar, rows):
         cash = entries[name].simulation.weights[0, :, 0]
         assert cash[0] > 0.5
         np.testing.assert_allclose(cash[rows + 21 :], 0, atol=1e-6)
+    assert abs(entries["buy-and-hold"].simulation.turnover.sum() - 1) < 0.05  # nothing is sold
     held, never = entries["buy-and-hold"], entries["equal-weight at 0"]
     np.testing.assert_array_equal(held.simulation.returns, never.simulation.returns)
 

@@ -394,7 +394,7 @@ def test_a_strategy_breaks_limits_that_depend_on_what_it_held_and_traded_before(
     mandate = {"trading": trading, "risk": {"volatility": 9.0}}
     backtest = create(mandate=mandate, strategies={"mine": mine})
     (said,) = backtest.replay.others({}, backtest._own, "equal-weight")[1][-1:]
-    assert "breaks the mandate in 1 of its 3 orders" in said
+    assert "breaks the mandate, apart from limits of risk, in 1 of its 3 orders" in said
     assert "turnover of the year is too high (1, by up to 0.4" in said
     mine[140] = [0.02, 0.5, 0.4]
     backtest = create(mandate=mandate, strategies={"mine": mine})
@@ -403,7 +403,7 @@ def test_a_strategy_breaks_limits_that_depend_on_what_it_held_and_traded_before(
     mine[140] = np.nan
     backtest = create(mandate=mandate, strategies={"mine": mine})
     (said,) = backtest.replay.others({}, backtest._own, "equal-weight")[1][-1:]
-    assert said == "mine keeps the mandate but for its limits of risk in all of its 2 orders."
+    assert said == "mine keeps the mandate, apart from limits of risk, in all of its 2 orders."
 
 
 @pytest.mark.parametrize("time", ["16:00", "16:00-05:00"])
@@ -416,6 +416,13 @@ def test_levels_and_returns_of_the_close_belong_to_their_day(time):
     twice = [f"{DAYS[120]} 10:00{time[5:]}", *dates]
     with pytest.raises(QfolioError, match=f"several returns on {DAYS[120]}, of which .* one row"):
         placed(pd.DataFrame({"date": sorted(twice), "return": 0.001}), prices)
+
+
+def test_an_order_with_a_time_zone_is_not_known_before_its_time():
+    hours = np.datetime64("2020-01-01T00") + np.arange(ROWS) * np.timedelta64(1, "h")
+    prices = price_table(random_walk(ROWS), dates=hours.astype("datetime64[s]"))
+    mine = pd.DataFrame({"date": [f"{hours[100]}:00-05:00", f"{hours[130]}:00-05:00"], "A": 0.5})
+    np.testing.assert_array_equal(read_own("mine", mine, prices).dates, hours[[105, 135]])
 
 
 def test_benchmarks_by_name():

@@ -14,7 +14,7 @@ from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.follow import follow
 from qfolio.portfolio.desk.rule import Rule
 from qfolio.portfolio.desk.standing import Standing
-from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 
 from tables import days, price_table, random_walk
@@ -212,3 +212,20 @@ def test_prices_from_which_an_asset_does_not_seem_late_are_named(tmp_path):
             said.append(" ".join(desk.terms(rule, known, allocation, 0.0)))
         assert "looks back" not in said[0]
         assert f"begin on 2020-04-05, but {name} looks back to 20" in said[1]
+
+
+def test_a_late_asset_is_named_where_another_was_delisted(tmp_path):
+    """OLMAR looks back on a week, but holds only assets with prices in all of the window."""
+    values = random_walk(160, 4)
+    values[:90, 2], values[120:, 3] = np.nan, np.nan
+    frame = pd.DataFrame(values, pd.DatetimeIndex(days(160), name="date"), list("ABCD"))
+    prices = load(frame, late="join", ended="cash-out")
+    Backtest.create(
+        prices, AGENTS, out=tmp_path / "run", train="100d", test="50d", seeds=1,
+        baselines=["olmar"],
+    )  # fmt: skip
+    desk = Desk.open(tmp_path / "run")
+    for name, named in (("olmar", True), ("equal-weight", False)):
+        rule, known = desk.followed(name), prices.between(95, None)
+        said = desk.terms(rule, known, Allocation.of(rule, known, np.zeros(4), 1000.0), 0.0)
+        assert any("but olmar looks back to 20" in each for each in said) == named

@@ -387,6 +387,20 @@ def test_the_files_of_a_folder_have_one_currency(tmp_path: Path):
     assert "prices are in several currencies: $ and €" in refusal(tmp_path)
 
 
+def test_currency_codes_of_a_folder_are_compared(tmp_path: Path):
+    for name, code in (("A", "USD"), ("B", "EUR")):
+        text = "date,ticker,close,currency\n" + rows(ISO, [[name, p, code] for p in "1234"])
+        (tmp_path / f"{name}.csv").write_text(text)
+    said = [str(each) for each in inspect(tmp_path)[1]]
+    assert "column 'currency': there are several currencies: EUR and USD" in said
+
+
+def test_files_of_an_asset_may_overlap_where_one_of_them_is_empty(tmp_path: Path):
+    for name, prices in (("old", ["1", "2", "", ""]), ("new", ["", "", "3", "4"])):
+        (tmp_path / f"{name}.csv").write_text("date,A\n" + rows(ISO, [[p] for p in prices]))
+    assert load(tmp_path).values[:, 0].tolist() == [1, 2, 3, 4]
+
+
 def test_a_folder_of_returns(tmp_path: Path):
     for name in ("A", "B"):
         text = f"date,{name}\n" + rows(ISO, [["-0.5"], ["1.5"], ["-1.0"], ["2.0"]])

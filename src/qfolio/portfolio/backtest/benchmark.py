@@ -59,8 +59,8 @@ def field_of(
     own: dict[str, Own] = {}
 
     def add(name: str, source: Any) -> None:
-        column = csv_cell(name) == name  # as it is in returns.csv
-        if not column or (name not in prices.assets and not _NAME.fullmatch(name)):
+        plain = csv_cell(name) == name  # as it is in returns.csv
+        if not plain or (name not in prices.assets and not _NAME.fullmatch(name)):
             raise QfolioError(
                 f"A strategy cannot be called {quote(name)}; begin with a letter or digit, and use "
                 "up to 60 letters, digits, spaces and the signs . , : & + - _ / % ( )."

@@ -116,6 +116,8 @@ def orders(
                     wanted = ask(name, baseline, history, held, mandated)
                 # A margin call must be met even if the baseline has no target.
                 goal = held if called and wanted is None else wanted
+                if entering and goal is not None and not asked:
+                    goal = _topped_up(held, goal)
                 order = None
                 if due and goal is not None:
                     order = obeying(goal, held, account.within_turnover(mandated))
@@ -233,6 +235,16 @@ def ask(
 def obeying(wanted: Floats, held: Floats, mandated: Feasible | None) -> Floats:
     """Target weights, projected onto what a mandate allows, if there is one."""
     return wanted if mandated is None else exactly(mandated, wanted, held)
+
+
+def _topped_up(held: Floats, wanted: Floats) -> Floats:
+    """What is held, with idle cash invested in what is held less than wanted; nothing is sold."""
+    lacking = np.maximum(wanted - held, 0.0)[1:]
+    idle = max(held[0] - wanted[0], 0.0)
+    if not lacking.any():
+        return held
+    bought = idle * lacking / lacking.sum()
+    return held + np.append(-bought.sum(), bought)
 
 
 def _cut(order: Floats, wanted: Floats, held: Floats, mandated: Feasible | None) -> bool:

@@ -172,7 +172,7 @@ def compliance(
 ) -> str:
     """Says where a strategy's orders break the mandate; they are carried out all the same.
 
-    Limits of risk are left to ``notes.too_risky``.
+    Limits of risk are checked by ``notes.too_risky``.
 
     Args:
         name: Name of the strategy.
@@ -191,15 +191,15 @@ def compliance(
         orders, days = orders + int(given.sum()), days + int((excess > TOLERANCE).any(0).sum())
         for said, by in zip(found, excess, strict=True):
             broken.setdefault(said.removesuffix(" by"), []).extend(by[by > TOLERANCE].tolist())
+    apart = ", apart from limits of risk," if mandates[0][1].limits_risk else ""
     if not days:
-        but = " but for its limits of risk" if mandates[0][1].limits_risk else ""
-        return f"{name} keeps the mandate{but} in all of its {amount(orders, 'order')}."
+        return f"{name} keeps the mandate{apart} in all of its {amount(orders, 'order')}."
     how = ", ".join(
         f"{said} ({len(by)}, by up to {max(by):.2g})" for said, by in broken.items() if by
     )
     return (
-        f"{name} breaks the mandate in {days} of its {amount(orders, 'order')}, which are carried "
-        f"out as they are: {how}."
+        f"{name} breaks the mandate{apart} in {days} of its {amount(orders, 'order')}, which are "
+        f"carried out as they are: {how}."
     )
 
 

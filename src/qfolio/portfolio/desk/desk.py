@@ -258,8 +258,9 @@ class Desk:
             yield f"These assets count as delisted since the backtest: {_with_ends(table, ended)}."
         dates = self.run.prices.dates
         known = np.concatenate([dates[dates < table.dates[0]], table.dates])
-        late = UNKNOWN  # where assets come and go, each may be held from its first price on
-        if table.tradable is None:
+        late = UNKNOWN
+        # Where assets come and go, a rule without estimates may hold each from its first price on.
+        if table.tradable is None or (isinstance(followed, Rule) and followed.baseline.estimates):
             before = self.run.prices
             late = before.dates[min(int(before.first_rows.max()), len(before) - 1)]
         what, rows = lookback(followed, known, table.month, late)

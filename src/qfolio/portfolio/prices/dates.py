@@ -59,14 +59,17 @@ class Dates(NamedTuple):
     unit: Unit | None  # what the column counts, if it holds numbers
 
 
-def read_dates(cells: np.ndarray) -> Dates:
+def read_dates(cells: np.ndarray, *, by_day: bool = False) -> Dates:
     """A column of cells as dates.
 
     Accepts dates and times, ISO 8601 and similar texts (2020-01-31, 2020/1/31, 20200131,
     2020-01-31 16:00+01:00), and 31/01/2020 or 01/31/2020 if at least one cell of the column shows
     which number is the day. Time zones are dropped: if all times are midnight in their own zones,
-    or each is of another day there, they are kept; otherwise they are converted to UTC. A column
-    that holds only numbers may count one of ``UNITS``.
+    the dates are kept; otherwise times are converted to UTC. A column that holds only numbers may
+    count one of ``UNITS``.
+
+    by_day: whether dates are also kept if each is of another day in its zone. Only for prices:
+    what is known beside several prices a day must not be dated earlier than it was known.
     """
     import pandas as pd
 
@@ -78,7 +81,7 @@ def read_dates(cells: np.ndarray) -> Dates:
     good = np.full(len(unique) + 1, np.datetime64("NaT", "s"))
     bad: list[str | None] = [None] * len(unique) + [NO_DATE]
     unit = _unit(counts := _counts(unique))
-    moments = _of_unit(counts, unit) if unit else _of_calendar(unique)
+    moments = _of_unit(counts, unit) if unit else _of_calendar(unique, by_day)
     for k, moment in enumerate(moments):
         if isinstance(moment, str):
             bad[k] = moment
@@ -171,7 +174,7 @@ def _seconds(count: float, unit: Unit) -> int:
 # Text and dates.
 
 
-def _of_calendar(cells: np.ndarray) -> list[datetime | str]:
+def _of_calendar(cells: np.ndarray, by_day: bool) -> list[datetime | str]:
     """Dates without time zones, or complaints."""
     ends = [match for match in map(_year_last, cells) if match]
     day_first, month_first = (any(int(match[k]) > 12 for match in ends) for k in (1, 2))
@@ -180,7 +183,7 @@ def _of_calendar(cells: np.ndarray) -> list[datetime | str]:
     aware = [m for m in moments if isinstance(m, datetime) and m.tzinfo]
     midnight = all(not (m.hour or m.minute or m.second) for m in aware)
     # The last of daily rows often has the time of the download.
-    local = midnight or len({m.date() for m in aware}) == len(aware)
+    local = midnight or (by_day and len({m.date() for m in aware}) == len(aware))
     read: list[datetime | str] = []
     for cell, moment in zip(cells, moments, strict=True):
         if isinstance(moment, str):

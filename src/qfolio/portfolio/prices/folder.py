@@ -10,7 +10,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import amount, quote
 from qfolio.portfolio.prices.findings import Findings, day
-from qfolio.portfolio.prices.grid import Grid, check_currency, signs
+from qfolio.portfolio.prices.grid import Grid, check_currencies
 from qfolio.portfolio.prices.reading import PARQUET_FILES, TEXT_FILES
 from qfolio.portfolio.prices.vocabulary import kind
 
@@ -34,10 +34,10 @@ def join(
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in known)
     if not files:
         raise QfolioError(f"{quote(folder, 300)} is a folder without tables (.csv or .parquet).")
-    parts, findings, currency = [], Findings(), set()
+    parts, findings, tables = [], Findings(), []
     for file in files:
         grid, found = read(file)
-        currency |= signs(grid.table, grid.prices.columns)
+        tables.append((grid.table, grid.prices.columns))
         findings += [
             replace(finding, message=f"in {quote(file.name)}: {finding.message}")
             for finding in found
@@ -52,9 +52,11 @@ def join(
             for channel, block in zip(channels, grid.features, strict=True):
                 columns[channel] = block.values[:, j if block.by_asset else 0]
             parts.append(pd.DataFrame(columns))
-    check_currency(currency, findings)
+    check_currencies(tables, findings)
     frame = pd.concat(parts, ignore_index=True)
-    some = frame.iloc[:, 2:].notna().any(axis=1).groupby(frame["date"]).transform("any")
+    filled = frame.iloc[:, 2:].notna().any(axis=1)
+    frame = frame[filled | ~frame.duplicated(["date", "ticker"], keep=False)]
+    some = filled[frame.index].groupby(frame["date"]).transform("any")
     if not some.all():
         empty = np.unique(frame["date"][~some])
         findings.warn(

@@ -73,16 +73,25 @@ def report_cells(
     findings.others("error", len(spots), block.name, more, advice=advice)
 
 
-def signs(table: Table, prices: Sequence[int]) -> set[str]:
-    """The currency signs in a table's columns of prices."""
-    return set().union(*(currencies(table.columns[j]) for j in prices))
-
-
-def check_currency(found: set[str], findings: Findings) -> None:
-    """Reports currency signs that differ."""
-    if len(found) > 1:
+def check_currencies(tables: Sequence[tuple[Table, Sequence[int]]], findings: Findings) -> None:
+    """Reports currencies that differ; each table comes with the numbers of its price columns."""
+    signs = set[str]().union(*(currencies(t.columns[j]) for t, prices in tables for j in prices))
+    if len(signs) > 1:
         findings.error(
-            f"prices are in several currencies: {' and '.join(sorted(found))}",
+            f"prices are in several currencies: {' and '.join(sorted(signs))}",
+            advice=ONE_CURRENCY,
+        )
+    said = [
+        (name, table.columns[j])
+        for table, _ in tables
+        for j, name in enumerate(table.names)
+        if plain(name) == "currency"
+    ]
+    codes = sorted({label(cell) for _, cells in said for cell in cells} - {""})
+    if len(codes) > 1:
+        findings.warn(
+            f"there are several currencies: {listed(codes[:LISTED])}",
+            column=said[0][0],
             advice=ONE_CURRENCY,
         )
 
@@ -90,20 +99,11 @@ def check_currency(found: set[str], findings: Findings) -> None:
 def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
     """The grid of a table; None if it would be far too large."""
     prices = columns.prices
-    check_currency(signs(table, prices), findings)
-    for j, name in enumerate(table.names):
-        if plain(name) == "currency":
-            codes = sorted({label(cell) for cell in table.columns[j]} - {""})
-            if len(codes) > 1:
-                findings.warn(
-                    f"there are several currencies: {listed(codes[:LISTED])}",
-                    column=name,
-                    advice=ONE_CURRENCY,
-                )
+    check_currencies([(table, prices)], findings)
     cells = table.columns[columns.date]
     if columns.time is not None:
         cells = with_times(cells, table.columns[columns.time])
-    moments, complaints, unit = read_dates(cells)
+    moments, complaints, unit = read_dates(cells, by_day=True)
     if unit:
         findings.note(f"dates are read as {unit.name}", column=table.names[columns.date])
     used = [*prices, *(j for feature in columns.features for j in feature.columns)]

@@ -82,8 +82,8 @@ def test_bootstrap_measures_are_the_measures_of_the_resampled_days(
     returns, turnover, cost = rng.random((3, 2, 30)) / 10
     returns -= 0.05
     returns[1, 7] = -1  # some histories are ruined, others are not
-    monkeypatch.setattr(bootstrap, "_CHUNK", 60)
-    monkeypatch.setattr(bootstrap, "_TOGETHER", 3)  # histories at a time; 60 has room for two
+    monkeypatch.setattr(bootstrap, "CHUNK", 60)
+    monkeypatch.setattr(bootstrap, "TOGETHER", 3)  # histories at a time; 60 has room for two
     drawn = bootstrap_measures(returns, turnover, cost, 252, 4, 7, np.random.default_rng(5))
     again = np.random.default_rng(5)
     picks = np.concatenate([stationary_bootstrap_indices(30, 4, n, again) for n in (3, 3, 1)])

@@ -62,8 +62,8 @@ class Baseline(ABC):
         months: Latest months whose returns it reads (default: the training window and all rows
             since).
         least: Number of returns that it reads at least, if there are so many.
-        buys_once: Whether its first target is ordered until limits on turnover no longer cut it,
-            and each order is filled before ``decide`` is called again.
+        buys_once: Whether what its first target lacks is bought until limits on turnover no longer
+            cut the purchase, and each order is filled before ``decide`` is called again.
     """
 
     calendar: ClassVar[Calendar] = "fold"
