@@ -79,8 +79,10 @@ def test_the_conclusion_says_who_beats_the_reference(plain: BacktestData) -> Non
     risk = found(plain, DQN=("none", "better"))
     assert conclusion(risk).startswith(
         "DQN-together beats equal weight, however it is rebalanced, in return for the risk, but "
-        "not in growth: it grew"
+        "not clearly in growth: it grew"
     )
+    less = found(plain, DQN=("worse", "better"))
+    assert "in return for the risk, but not in growth: " in conclusion(less)
 
 
 def test_the_conclusion_says_that_nobody_does(plain: BacktestData) -> None:

@@ -92,6 +92,19 @@ def test_signals_that_change_nothing_are_folded_up(explained, ignored):
     assert page.count("<details") == page.count("</details>")
 
 
+def test_a_rule_of_drift_is_not_said_to_be_learned(explained):
+    agent = explained.why.agents["DQN-together"]
+    pulls = [replace_in(pull, size=1e-6) for pull in agent.gradients.pulls]
+    faint = replace_in(agent, gradients=replace_in(agent.gradients, whole=2e-6, pulls=pulls))
+    said = "the rule describes how weights drift between trades, not what the agent learned."
+    for shown, drifts in ((agent, False), (faint, True)):
+        why = replace_in(explained.why, agents={"DQN-together": shown})
+        (section,) = why_sections(replace(explained, why=why))
+        widths = [row["pull"]["width"] for row in section["signals"] if row["pull"]]
+        assert (max(widths) == 0) == drifts
+        assert any(said in each for each in section["told"]) == drifts
+
+
 def test_small_parts_have_more_digits(explained):
     parts = made_up_why().agents["DQN-together"].decomposition
     small = type(parts)(0.1315, 0.131, 0.001, 0.0001, 0.1, 0.0006, [], [])

@@ -140,6 +140,20 @@ def test_runs_are_compared(board: Board, browser: Browser, tmp_path: Path) -> No
     assert "second" in names
 
 
+def test_the_report_that_is_opened_is_that_of_the_run_shown(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    for name in ("first", "second"):
+        write(tmp_path / "runs" / name, agents=["dqn"])
+        (tmp_path / "runs" / name / "report.html").write_text(f"<title>{name}</title>")
+    browser.show(board.url, 1280, "document.querySelector('#lede a') !== null")
+    title, link = (f"document.querySelector('{at}')" for at in ("#title", "#lede a"))
+    shown = browser.evaluate(f"{title}.textContent"), browser.evaluate(f"{link}.href")
+    browser.click("#runs li:not(.chosen) .item")
+    browser.wait(f"{title}.textContent !== '{shown[0]}'")
+    assert browser.evaluate(f"{link}.href") != shown[1]
+
+
 def test_a_run_that_is_deleted_leaves_the_page(
     board: Board, browser: Browser, tmp_path: Path
 ) -> None:

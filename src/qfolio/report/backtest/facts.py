@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
+import numpy as np
+
 from qfolio.core.statistics import FEWEST_SEEDS
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
@@ -17,7 +19,8 @@ from qfolio.report.rendering import THIN_SPACE, number
 def key_facts(data: BacktestData) -> list[str]:
     """The test's dates, assets, costs and other key facts, in a few words each."""
     test, settings, unit = data.assessment, data.config, unit_of(data.assessment.periods_per_year)
-    years = number(test.periods / test.periods_per_year)
+    first, last = (np.datetime64(str(date)[:10]) for date in (test.first_date, test.last_date))
+    years = number(((last - first).astype(int) + 1) / 365.25)
     return [
         str(data.prices["source"]),
         f"{test.first_date} to {test.last_date} ({years} years)",

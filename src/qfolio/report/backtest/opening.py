@@ -12,7 +12,7 @@ from qfolio.core.text import listed
 from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment
 from qfolio.portfolio.backtest.statistics.differences import Difference
 from qfolio.portfolio.backtest.statistics.estimates import Measured
-from qfolio.portfolio.backtest.statistics.verdict import claims, comparable, wiped_out
+from qfolio.portfolio.backtest.statistics.verdict import claims, comparable, p_text, wiped_out
 from qfolio.report.axis import Axis, ticks_around
 from qfolio.report.backtest.data import BacktestData, followed_names, shown_order
 from qfolio.report.rendering import number, percent
@@ -99,9 +99,11 @@ def conclusion(data: BacktestData) -> str:
         return f"{listed(winners)} {verb} {other} in growth{also}: {told(listed(winners))}."
     if winners := which("sharpe", "better"):
         verb = "beats" if len(winners) == 1 else "beat"
+        than = _others(winners, test, better=True)
+        clearly = "" if set(winners) & set(which("growth", "worse", "ruined")) else "clearly "
         return (
-            f"{listed(winners)} {verb} {_others(winners, test, better=True)} in return for the "
-            f"risk, but not in growth: {told(listed(winners))}."
+            f"{listed(winners)} {verb} {than} in return for the risk, but not {clearly}in growth: "
+            f"{told(listed(winners))}."
         )
     subject = lead if len(names) == 1 else ""
     if len(which("growth", "worse", "ruined")) == len(names):
@@ -148,9 +150,11 @@ def best_sentence(data: BacktestData) -> str:
     if lead is None or (rival := to_best_sharpe(lead, test)) is None:
         return said
     low, high = (number(end, 2, sign=True) for end in rival.sharpe.interval)
+    p = rival.sharpe.p_holm
+    corrected = "" if p is None else f"; corrected p {p_text(p)}"
     return (
-        f"{said} The Sharpe ratio of {lead} less that of {rival.reference} is "
-        f"{number(rival.sharpe.value, 2, sign=True)} (95% interval {low} to {high})."
+        f"{said} The Sharpe ratio of {lead} less that of the best baseline, {rival.reference}, is "
+        f"{number(rival.sharpe.value, 2, sign=True)} (95% interval {low} to {high}{corrected})."
     )
 
 

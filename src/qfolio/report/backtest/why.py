@@ -26,6 +26,13 @@ LISTED = 20
 SIGNIFICANT = 1.96
 """The t-statistic beyond which a figure is bold: 5% of those with no true effect exceed it."""
 
+SHOWN = 5e-6
+"""Signals that all move a weight by less are drawn without bars: their figures round to 0.000%."""
+
+FAINT = 0.1
+"""Signals that together move weights by less than this share of the linear rule's largest
+coefficient do not explain it."""
+
 
 def why_sections(data: BacktestData) -> list[dict[str, Any]]:
     """The section's content for each agent that has an attribution."""
@@ -176,7 +183,7 @@ def _signals(why: AgentWhy) -> list[dict[str, Any]]:
                 "pull": None
                 if pull is None
                 else {
-                    "width": round(100 * pull.size / longest, 2),
+                    "width": round(100 * pull.size / longest, 2) if longest >= SHOWN else 0.0,
                     "size": percent(pull.size, 2 if longest > 1e-3 else 3),
                     "sign": "" if abs(pull.direction) < 0.2 else "▲" if pull.direction > 0 else "▼",
                 },
@@ -217,6 +224,12 @@ def _told(why: AgentWhy) -> list[str]:
             f"The linear rule explains {percent(max(rule.r2, 0.0), 0)} of the active weights in "
             "the folds that it was not fitted on (R²)."
         )
+        largest = max(abs(term.per_deviation) for term in rule.terms)
+        if why.gradients and why.gradients.whole < FAINT * largest:
+            sentences.append(
+                "Its orders hardly depend on the signals, so the rule describes how weights drift "
+                "between trades, not what the agent learned."
+            )
     return sentences
 
 

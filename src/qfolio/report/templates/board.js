@@ -222,8 +222,9 @@ function header(shown, single) {
       words.push(" ", element("a", { textContent: "Open the report", target: "_blank", rel: "noopener",
         href: `/reports/${single.key}/report.html` }), ".");
     }
-    if (lede.dataset.said !== text + also + single.report) lede.replaceChildren(...words);
-    lede.dataset.said = text + also + single.report;
+    const said = [single.key, text, also, single.report].join(" ");
+    if (lede.dataset.said !== said) lede.replaceChildren(...words);
+    lede.dataset.said = said;
     facts.push(["done", percent(single.share)], [done ? "took" : "so far", span(until - begun - single.paused)]);
     if (single.state === "running") facts.push(["left", span(left)], ["steps a second", single.rate ? number(Math.round(single.rate)) : "–"]);
     if (single.seeds) facts.push(["seeds", String(single.seeds)]);
