@@ -44,16 +44,17 @@ class Budget:
 
     def env_steps(self, task: "Task", agent: "Agent") -> int:
         """Environment steps of a member, if no episode ends early."""
-        from qfolio.core.training import episode_steps
-
-        return self.amount * (episode_steps(task, agent) if self.steps is None else 1)
+        return self.amount * self._of_a_unit(task, agent)
 
     def longest(self, task: "Task", agent: "Agent") -> int:
         """Steps of each environment, if no episode ends early."""
+        return -(-self.amount // agent.num_envs) * self._of_a_unit(task, agent)
+
+    def _of_a_unit(self, task: "Task", agent: "Agent") -> int:
+        """Steps of an episode, or 1."""
         from qfolio.core.training import episode_steps
 
-        rounds = -(-self.amount // agent.num_envs)
-        return rounds * (episode_steps(task, agent) if self.steps is None else 1)
+        return episode_steps(task, agent) if self.steps is None else 1
 
     def to_json(self) -> dict[str, int]:
         """``{"episodes": n}`` or ``{"steps": n}``."""

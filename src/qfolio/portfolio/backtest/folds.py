@@ -9,6 +9,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError, TooFewRowsError
 from qfolio.core.text import amount
 from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.frequency import one_a_day
 from qfolio.portfolio.prices.table import Prices
 
 
@@ -152,8 +153,7 @@ def spell(date: np.datetime64, dates: np.ndarray) -> str:
 
 def spell_all(some: np.ndarray, dates: np.ndarray) -> list[str]:
     """Some dates of a table as text, with times if rows are less than a day apart."""
-    days = dates.astype("datetime64[D]")
-    if (days[1:] > days[:-1]).all():
+    if one_a_day(dates):
         return list(map(str, some.astype("datetime64[D]")))
     texts = map(str, some.astype("datetime64[s]"))
     return [text.replace("T", " ") for text in texts]

@@ -103,6 +103,7 @@ def orders(
                     continue  # nothing can happen, as on most days of a monthly calendar
                 held = account.held(row)
                 called = terms.calls(held)
+                # What is bought once is bought whole, before anything else is asked for.
                 waits = baseline.buys_once and account.filling
                 anew = asks[row] and not waits and (wanted is None or not entering)
                 # A margin call asks for a new target, unless that of the fold stands.

@@ -19,6 +19,7 @@ from qfolio.portfolio.backtest.orders import TOLERANCE
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.frequency import one_a_day
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
@@ -220,8 +221,8 @@ def rows_at(name: str, dates: Dates, prices: Prices) -> tuple[Rows, Dates]:
     given for a table with several rows a day.
     """
     ours, days = prices.dates, dates.astype("datetime64[D]")
-    by_day = ours.astype("datetime64[D]")
-    if (by_day[1:] > by_day[:-1]).all():
+    if one_a_day(ours):
+        by_day = ours.astype("datetime64[D]")
         rows = np.searchsorted(by_day, days)
         known = rows < len(ours)
         return rows, days[known][by_day[rows[known]] != days[known]]
@@ -300,10 +301,9 @@ def _levels(own: Own, rows: Dates) -> tuple[Rows, Bools]:
     Where the rows or the levels are one a day, those of the same day belong together: a row of a
     day is its close.
     """
-    dates, by_day = own.dates, rows.astype("datetime64[D]")
-    days = dates.astype("datetime64[D]")
-    if (by_day[1:] > by_day[:-1]).all() or (dates == days).all():
-        dates, rows = days, by_day
+    dates, days = own.dates, own.dates.astype("datetime64[D]")
+    if one_a_day(rows) or (dates == days).all():
+        dates, rows = days, rows.astype("datetime64[D]")
     latest = np.searchsorted(dates, rows, side="right") - 1
     return latest, (latest < 0) | (rows - dates[np.maximum(latest, 0)] > OLDEST)
 

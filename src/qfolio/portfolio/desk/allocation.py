@@ -292,15 +292,16 @@ def require_fresh(prices: Prices, as_of: str | None) -> None:
             f"--as-of is {quote(as_of)}; it must be a date such as 2025-12-31."
         ) from None
     last = prices.dates[-1].astype("datetime64[D]").item()
-    several = spacing(prices.dates)[1] < 1 if len(prices) > 1 else False
-    # Several rows a day are in UTC, where the next day has begun in an American evening.
-    newest = datetime.datetime.now(datetime.UTC).date() if several and as_of is None else today
-    if last > max(today, newest):
+    usual = spacing(prices.dates)[1] if len(prices) > 1 else 1.0
+    newest = today
+    if usual < 1 and as_of is None:
+        # Several rows a day are in UTC, where the next day has begun in an American evening.
+        newest = max(today, datetime.datetime.now(datetime.UTC).date())
+    if last > newest:
         raise QfolioError(
             f"The prices end on {last}, after {today}; leave out the later rows, or set "
             "a later --as-of."
         )
-    usual = spacing(prices.dates)[1] if len(prices) > 1 else 1.0
     if today - last > MAX_AGE + datetime.timedelta(days=max(0, round(usual) - 1)):
         raise QfolioError(
             f"The prices are stale: they end on {last}, {(today - last).days} days before {today}; "

@@ -19,6 +19,12 @@ def spacing(dates: np.ndarray) -> tuple[np.ndarray, float]:
     return steps, float(np.sort(steps)[(len(steps) - 1) // 2])
 
 
+def one_a_day(dates: np.ndarray) -> bool:
+    """Whether no two rows are of the same day."""
+    days = dates.astype("datetime64[D]")
+    return bool((days[1:] > days[:-1]).all())
+
+
 def days_a_week(dates: np.ndarray) -> int:
     """On how many days of the week a market is open: 5, 6 or 7.
 
