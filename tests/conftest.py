@@ -41,8 +41,6 @@ from qfolio.core.population import programs_of  # noqa: E402
 from qfolio.tasks.pendulum import Pendulum  # noqa: E402
 
 devices.configure()
-# Also the many little ones, which other files and the other process would compile again.
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def pytest_collection_finish():
