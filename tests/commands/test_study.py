@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from qfolio.commands.study import _numbers
+from qfolio.commands.study import _numbers, _tables
 from qfolio.portfolio.study.run import Study
 
 from shell import TINY_BACKTEST, qfolio, succeed
@@ -110,6 +110,11 @@ def test_strategies_benchmark_and_mandate_hold_for_every_table(
 def test_lags_and_costs_are_lists_beside_the_main_value():
     assert _numbers("--costs-bps", "20, 10,50", 10.0) == [10, 20, 50]
     assert _numbers("--lags", None, 2) == [2]
+
+
+def test_tables_are_called_as_their_files_in_any_script():
+    files = ("bo\u0308rse.csv", "株価.csv", "指数=index.csv", "S&P 500.csv")
+    assert list(_tables(files, str)) == ["b\u00f6rse", "株価", "指数", "S-P-500"]
 
 
 def test_a_folder_has_one_configuration(place, monkeypatch, capsys):

@@ -14,7 +14,18 @@ from qfolio.core.statistics import (
     mean_interval,
     probability_of_improvement,
     rank_test,
+    regret,
 )
+
+
+@pytest.mark.parametrize("optimum", [None, 0.0])
+def test_there_is_no_share_of_an_optimum_of_zero(optimum: float | None) -> None:
+    assert regret([-1.0, 0.0, 1.0], optimum) is None
+
+
+def test_a_regret_is_a_share_of_the_size_of_the_optimum() -> None:
+    assert regret([-300.0, -200.0, -150.0], -200.0) == pytest.approx([0.5, 0.0, -0.25])
+    assert regret(1.5, 2.0) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize(

@@ -144,6 +144,15 @@ def test_an_optimum_of_zero_leaves_no_share_to_miss(tmp_path):
     assert measured == {"return": -1.0, "optimum": 0.0, "regret": None}
 
 
+def test_a_curve_whose_optimum_is_zero_is_ranked_by_its_returns():
+    """The curve has fewer starts than the grade, of which the optimum may not be zero."""
+    found = dataclasses.replace(result(BAD), curve_optimum=0.0)
+    ranking = rank({"slow": found, "quick": found})
+    assert ranking["measure"] == "return"
+    assert ranking["agents"]["slow"]["area"]["iqm"] == np.mean([-250.0, -150.5])
+    json.dumps(ranking, allow_nan=False)
+
+
 def test_ranking_by_return_where_no_optimum_is_known():
     best = result([480.0, 500.0, 500.0, 490.0], curve=(10.0, 460.0, 500.0), optimum=None)
     worse = result([120.0, 130.0, 110.0, 90.0], curve=(10.0, 100.0, 120.0), optimum=None)
@@ -337,7 +346,7 @@ def test_resuming_gives_the_same(finished, tmp_path, stop):
         return []
 
     run.run(listen)
-    assert trained == [("quick", 0.0, 1.0)]
+    assert trained == [("quick", 0.5, 0.5)]  # of the whole, with what was done before
     for name, expected in finished[0].results.items():
         assert run.results[name].returns == expected.returns
         assert run.results[name].env_steps == expected.env_steps

@@ -279,10 +279,14 @@ def test_two_processes_cannot_train_in_one_folder(task, agent, tmp_path):
 def test_a_run_that_was_trained_further_elsewhere_is_not_cut_back(task, agent, tmp_path):
     run, other = create(task, agent, tmp_path / "run"), Run.open(tmp_path / "run")
     other.train()
-    before = contents(tmp_path / "run")
+    other.summary()
+    before, graded = contents(tmp_path / "run"), (tmp_path / "run" / "summary.json").read_bytes()
     with pytest.raises(QfolioError, match="run was trained further elsewhere; open it again"):
         run.train(Budget(2))
+    with pytest.raises(QfolioError, match="run was trained further elsewhere; open it again"):
+        run.summary()  # of what it was before
     np.testing.assert_equal(contents(tmp_path / "run"), before)
+    assert (tmp_path / "run" / "summary.json").read_bytes() == graded
     other.train(Budget(14))
     other.train(Budget(16))
     assert Run.open(tmp_path / "run").episodes == 16

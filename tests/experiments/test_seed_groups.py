@@ -89,11 +89,12 @@ def test_a_stopped_run_asks_for_what_is_missing(task, agent, tmp_path, folder):
     told = []
 
     def listen(job, done, share):
-        told.append(job.name)
+        told.append((job.name, done, share))
         return []
 
     run.train(executor=Here(), listen=listen)
-    assert told == ["dqn/1", "dqn/2"]
+    third = pytest.approx(1 / 3)
+    assert told == [("dqn/1", third, third), ("dqn/2", pytest.approx(2 / 3), third)]
     assert not run.interrupted
     assert not run.groups.begun
     alone = start(task, agent)

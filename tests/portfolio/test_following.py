@@ -1,5 +1,7 @@
 """What a policy is told that it holds, against the replay in double precision."""
 
+import sys
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.costs import Proportional, with_cash
 from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.mandate.feasible import exactly
 from qfolio.portfolio.policy import Policy
@@ -82,3 +85,27 @@ def test_orders_are_the_nearest_under_limits_on_risk(policy, prices):
     # Near the nearest point, distances hardly change.
     np.testing.assert_allclose(targets[0], nearest, atol=1e-3)
     assert np.abs(targets[0] - wanted).max(-1).min() > 0.05
+
+
+class Dividend(Proportional):
+    share = 0.0
+
+    def carry(self, relatives, context):
+        return with_cash(relatives * (1 + self.share))
+
+
+def test_a_cost_model_that_is_defined_again_is_the_one_that_is_followed(monkeypatch):
+    """By a backtest and by its replays, which share the programs of equal settings, too."""
+    prices = price_table(random_walk(20, volatility=0.0))
+    task = Portfolio.of(prices, window=5, horizon=5, cost_model=f"{__name__}:Dividend")
+    agent = Pathwise(hidden=(2, 2), num_envs=1, rollout_length=5)
+    members = Population(task, agent, [0]).weights()
+
+    def cash_later():
+        targets, held = follow(task, agent, members, 10, begin(task, [[0.5, 0.5, 0.0, 0.0]]), 1)
+        return float(held.weights[0, 0, 0] / targets[0, 0, 0])
+
+    assert cash_later() == pytest.approx(1)
+    again = type("Dividend", (Dividend,), {"share": 1.0})
+    monkeypatch.setattr(sys.modules[__name__], "Dividend", again)
+    assert cash_later() < 0.9

@@ -1,5 +1,6 @@
 import pytest
 
+from qfolio.commands.console.study import print_study
 from qfolio.report.study import render_study
 
 from backtests import ATTACK, Page
@@ -16,15 +17,35 @@ def page(count, lags=1, costs=1, **changes):
 def test_every_table_has_a_row_and_an_interval(count):
     shown = page(count)
     bars = [at for _, at in shown.tags if (at.get("class") or "").startswith("bar ")]
-    assert len(bars) == 2 * (count + 1)  # two agents, each with a pooled row
+    pooled = count > 1
+    assert len(bars) == 2 * (count + pooled)  # two agents, each with a pooled row
     assert all("95% interval" in (at["aria-label"] or "") for at in bars)
     styles = [at["style"] or "" for _, at in shown.tags if "left:" in (at.get("style") or "")]
     places = [float(style.split("left:")[1].split("%")[0].split(";")[0]) for style in styles]
     assert all(0 <= place <= 100 for place in places)
-    assert shown.text.count("Pooled") >= 2
     assert "short is left out. 120 rows are too few." in shown.text
-    assert "Its worst table is" in shown.text
-    assert ("worst" in [word.strip() for word in shown.words]) == (count > 1)
+    for word in ("Pooled", "worst"):
+        assert [each.strip() for each in shown.words].count(word) == 2 * pooled
+    assert ("Its worst table is" in shown.text) == pooled
+
+
+@pytest.mark.parametrize("costs", [1, 2])
+def test_a_table_alone_is_not_pooled(costs, capsys):
+    config, result = study(1, costs=costs)
+    for pools in (each for entry in result.variants for each in entry.agents.values()):
+        (only,) = pools.evidence.values()
+        pooled = pools.to_reference
+        shown = (pooled.growth, pooled.low, pooled.high, pooled.z)
+        own = only.to_reference
+        assert shown == pytest.approx((own.growth, own.low, own.high, own.z))
+    print_study(result)
+    page = Page(render_study(config, result, {}, {}))
+    assert "tilts and pathwise on table-1" in page.text
+    for text in (capsys.readouterr().out, page.text):
+        for word in ("pool", "stouffer", "1 table", "tables", "table by table"):
+            assert word not in text.lower().replace("in tables/", "")
+        assert "in growth after costs on table-1: the difference in annual growth is" in text
+        assert "earlier looks at its table are known" in text
 
 
 def test_the_page_shows_variants_and_counts_looks():

@@ -1,5 +1,7 @@
 import dataclasses
 import itertools
+import sys
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -73,6 +75,20 @@ def test_solutions_come_back_from_disk(tmp_path, monkeypatch):
     monkeypatch.setenv("QFOLIO_CACHE", str(tmp_path))
     file.write_bytes(b"damaged")
     np.testing.assert_array_equal(exact(task).returns(keys), first)
+
+
+def test_a_task_of_a_notebook_is_solved_again(tmp_path, monkeypatch):
+    """Its class has no file that could tell whether it has changed."""
+    monkeypatch.setenv("QFOLIO_CACHE", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "notebook", ModuleType("notebook"))
+
+    class Own(Pendulum):
+        __module__ = "notebook"
+
+    keys = start_keys(4)
+    returns = exact(Own(horizon=3)).returns(keys)
+    assert list(tmp_path.iterdir()) == []
+    np.testing.assert_array_equal(returns, exact(Pendulum(horizon=3)).returns(keys))
 
 
 def test_solutions_of_other_grids_and_of_other_arrays_are_not_taken(tmp_path, monkeypatch):

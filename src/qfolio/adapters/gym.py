@@ -7,6 +7,7 @@
 ``IDS`` holds the others, one for each task that ``qfolio train`` knows by name.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -123,6 +124,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             }
         )
         self.action_space = _action_space(self.task.actions)
+        self._referents = self.task.referents
         self._row, self._steps = -1, self.task.horizon  # over
 
     def reset(
@@ -160,7 +162,9 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         row, lag = self._row, self.task.lag
         given = self._checked(action)
         with jax.enable_x64(True):
-            ordered, self._plan = _target(self.task, np.int32(row), self._held, self._plan, given)
+            ordered, self._plan = _target(
+                self._referents, self.task, np.int32(row), self._held, self._plan, given
+            )
         target = np.asarray(ordered, float)
         self._target = target / target.sum()
         values, costs = self.prices.values[row : row + lag + 2], self.task.costs
@@ -179,7 +183,9 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         growth = max(1 + traded.returns[0], RUIN)
         earned = Outcome(growth, traded.cost[0], traded.weights[0])
         with jax.enable_x64(True):
-            reward, memory = _reward(self.task, np.int32(row), self._memory, earned)
+            reward, memory = _reward(
+                self._referents, self.task, np.int32(row), self._memory, earned
+            )
             self._memory = _doubled(memory)
         coming = np.nan_to_num(values[1] / values[0], nan=1.0)
         self._held = costs.held(self._target, coming, known.holding(0, 1))
@@ -242,16 +248,21 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         return day(self.prices.dates[row])
 
 
-@jax.jit
-def _target(task: Any, row: Any, held: Any, plan: Any, action: Any) -> Any:
+_compiled = partial(jax.jit, static_argnums=0)
+"""Compiles a function of what a task refers to, the task, and more. An environment looks the first
+up once, not at each step as ``task_jit`` does, because that takes longer than a step."""
+
+
+@_compiled
+def _target(_referents: Any, task: Any, row: Any, held: Any, plan: Any, action: Any) -> Any:
     """The weights to trade to, and the plan at the next row."""
     holding = task.hold(held)._replace(plan=plan)
     traded, plan = task.trade(row, holding, task.wanted(row, holding, _on_simplex(task, action)))
     return traded, task.planned(row, plan)
 
 
-@jax.jit
-def _reward(task: Any, row: Any, memory: Any, earned: Outcome) -> Any:
+@_compiled
+def _reward(_referents: Any, task: Any, row: Any, memory: Any, earned: Outcome) -> Any:
     """The reward of a row, and the reward's state after it."""
     reward, memory = task.reward_function(memory, earned)
     return task.compared(row, row + 1, reward), memory
@@ -302,6 +313,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
             raise QfolioError(f"render_mode is {render_mode!r}; {name} has none.")
         task: Any = settings.build(find("task", name), chosen)
         self.task, self._steps = task, task.horizon  # over
+        self._referents = task.referents
         self._there = jax.device_put(task)  # copies its arrays once, not at each step
         seen = jax.eval_shape(lambda key: task.observe(task.reset(key)), jax.random.key(0))
         number = lambda x: spaces.Box(-_LARGEST, _LARGEST, x.shape, np.float32)  # noqa: E731
@@ -323,7 +335,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self._steps = 0
         self._seed = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
-        self._state, observation = _reset(self._there, self._seed)
+        self._state, observation = _reset(self._referents, self._there, self._seed)
         return self._as_numpy(observation), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -338,8 +350,9 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         if not self.action_space.contains(given) or not np.isfinite(given).all():
             raise QfolioError(f"The action is {action!r}; it must be in {self.action_space}.")
         given = given.astype(np.int32) if numbered else given
+        time = np.int32(self._steps)
         after, observation = _step(
-            self._there, self._state, given, self._seed, np.int32(self._steps)
+            self._referents, self._there, self._state, given, self._seed, time
         )
         self._state, self._steps = after.state, self._steps + 1
         terminated = bool(after.terminated)
@@ -356,14 +369,14 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         return np.array(observation, np.float32)
 
 
-@jax.jit
-def _reset(task: Any, seed: Any) -> Any:
+@_compiled
+def _reset(_referents: Any, task: Any, seed: Any) -> Any:
     state = task.reset(jax.random.key(seed))
     return state, task.observe(state)
 
 
-@jax.jit
-def _step(task: Any, state: Any, action: Any, seed: Any, time: Any) -> Any:
+@_compiled
+def _step(_referents: Any, task: Any, state: Any, action: Any, seed: Any, time: Any) -> Any:
     key = step_key(jax.random.key(seed), time)
     after = task.step(state, _on_simplex(task, action), key)
     return after, task.observe(after.state)

@@ -175,7 +175,7 @@ def allocate(
         why = reasons(followed, table, allocation, spent)
         trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
     else:
-        notes = followed.notes(table)
+        notes = followed.notes(table, allocation.held, spent=spent)
     print_allocation(allocation, standing, trained, shares=not table.levels)
     for reason in why:
         console.tell(f"Why {sentence(reason)}")

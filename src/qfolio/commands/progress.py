@@ -84,27 +84,33 @@ class JobsProgress:
     """A bar over all jobs of an experiment; without a terminal, a line for each tenth.
 
     Called before each job, it returns the listener of that job's training. Jobs may run side by
-    side.
+    side. What was done before an experiment was resumed counts, but not for the time left.
     """
 
     def __init__(self, update: Callable[..., None]) -> None:
         self.update, self.begun, self.said = update, perf_counter(), ""
         self.parts: dict[str, float] = {}  # share of all work that each job has done
+        self.before: dict[str, float] = {}  # the same, when it was resumed
+        self.known = False  # whether a job has begun to learn, so that its speed predicts the rest
 
     def __call__(self, job: "Job", done: float, share: float) -> list[Listener]:
-        """done, share: the finished share of all jobs, and the share of this job."""
+        """done, share: of the whole experiment, what is finished and what this job is."""
+        if not self.parts:
+            self.parts[""] = self.before[""] = done  # by jobs that ran before it was resumed
         return [_JobProgress(self, job.name, share)]
 
     def note(self, job: str, part: float, learning: bool) -> None:
         """Notes the share of all work that a job has done (``part``) and updates the bar.
 
-        learning: whether the job has begun to learn, so that its speed predicts the time left.
+        learning: whether the job has begun to learn.
         """
         self.parts[job] = part
+        self.before.setdefault(job, part)
+        self.known |= learning
         agent, done = job.partition("/")[0], sum(self.parts.values())
-        known = learning or done > part
+        here = done - sum(self.before.values())
         spent = perf_counter() - self.begun
-        left = time_left(spent * (1 / done - 1) if known and done else math.nan)
+        left = time_left(spent * (1 - done) / here if self.known and here > 0 else math.nan)
         description = f"{agent}  {left} left"
         self.update(completed=done, description=description)
         if not console.is_terminal and f"{done:.1f}" != self.said:
@@ -117,11 +123,11 @@ class _JobProgress(Listener):
         self.whole, self.job, self.share = whole, job, share
 
     def on_start(self, training: Training) -> None:
-        self.whole.note(self.job, 0.0, learning=False)
+        self.whole.note(self.job, self.share * training.share_since(), learning=False)
 
     def on_chunk(self, training: Training, rows: Records) -> None:
         learning = not math.isnan(training.seconds_left)
-        self.whole.note(self.job, self.share * training.share, learning)
+        self.whole.note(self.job, self.share * training.share_since(), learning)
 
 
 def print_batch(now: "Progress | None" = None) -> None:

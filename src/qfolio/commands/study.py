@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from unicodedata import normalize
 
 from tyro.conf import Positional, arg
 
@@ -93,7 +94,7 @@ def study(
         run.run(listen, write_page, executor)
     if run.interrupted:
         stop(resume)
-    with resumable(resume), console.working("Pooling the evidence and writing the report"):
+    with resumable(resume), console.working("Weighing the evidence and writing the report"):
         result = run.result()
         write_study_report(run)
     print_study(result)
@@ -105,9 +106,10 @@ def _tables(sets: tuple[str, ...], load: Any) -> "dict[str, Prices]":
     """The tables by name, in the order of the command line."""
     files: dict[str, Path] = {}
     for entry in sets:
-        named = re.fullmatch(r"([A-Za-z0-9_-]+)=(.+)", entry)
+        named = re.fullmatch(r"([\w-]+)=(.+)", entry)
         file = Path(named[2] if named else entry)
-        name = named[1] if named else re.sub(r"[^A-Za-z0-9_-]+", "-", file.stem)
+        stem = normalize("NFC", file.stem)  # macOS writes ö as o and its dots, which are no letter
+        name = named[1] if named else re.sub(r"[^\w-]+", "-", stem)
         if name in files:
             raise QfolioError(
                 f"{files[name]} and {file} are both called {name}; name one with NAME=FILE."

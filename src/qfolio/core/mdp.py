@@ -8,8 +8,19 @@ interfaces of this file.
 import abc
 import math
 from collections.abc import Callable, Hashable, Mapping
+from functools import wraps
 from numbers import Integral
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Concatenate,
+    NamedTuple,
+    ParamSpec,
+    Protocol,
+    TypeVar,
+    runtime_checkable,
+)
 
 import equinox as eqx
 import jax
@@ -20,6 +31,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 from qfolio.core import devices
 from qfolio.core.errors import require_type, require_whole
 from qfolio.core.fields import require, require_static
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 # Every task and every agent begins with this module: here jax has not made an array yet, after
 # which settings of its devices have no effect.
@@ -198,6 +212,24 @@ class Task(eqx.Module):
         A number is None if the policy does not have it, such as an edge that it never trades to.
         """
         return {}
+
+
+def task_jit(function: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
+    """``eqx.filter_jit`` of a function whose first argument is a task.
+
+    It compiles anew if what the task refers to differs, see ``Task.referents``.
+    """
+
+    @eqx.filter_jit
+    def program(_referents: Hashable, *args: Any, **options: Any) -> Any:
+        return function(*args, **options)
+
+    @wraps(function)
+    def call(task: Any, *args: P.args, **options: P.kwargs) -> T:
+        found: T = program(task.referents, task, *args, **options)
+        return found
+
+    return call
 
 
 class Position(NamedTuple):

@@ -21,10 +21,14 @@ FEWEST_SEEDS = 5
 factor is 12.7 for two seeds and 4.3 for three, and a bootstrap of so few is far too narrow."""
 
 
-def regret(returns: ArrayLike, optimum: float) -> Floats:
-    """The share of the optimum's return that each return misses; not finite if the optimum is 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray((optimum - np.asarray(returns, dtype=float)) / np.abs(optimum))
+def regret(returns: ArrayLike, optimum: float | None) -> Floats | None:
+    """The share of the optimum's return that each return misses.
+
+    None if the optimum is unknown (None), or 0, of which there are no shares.
+    """
+    if not optimum:
+        return None
+    return np.asarray((optimum - np.asarray(returns, dtype=float)) / abs(optimum))
 
 
 def interquartile_mean(values: ArrayLike, axis: int = -1) -> Floats:

@@ -350,7 +350,8 @@ class Grades:
         solution = task.optimum()
         assert solution is not None
         self.task, self._best = task, solution.returns(start_keys())
-        if not self.optimum:
+        counts = Population.starts, Population.curve_starts
+        if not all(self._best[:starts].mean() for starts in counts):
             raise QfolioError(
                 f"Recovery is measured in shares of the optimum, but that of {task} is 0; "
                 "choose another task or change."
@@ -367,7 +368,9 @@ class Grades:
             population = Population(self.task, population.agent, population.seeds)
             population.restore(learned)
         returns = population.evaluate(start_keys(starts), tail=0).returns.mean(1)
-        return regret(returns, float(self._best[:starts].mean())).tolist()
+        found = regret(returns, float(self._best[:starts].mean()))
+        assert found is not None
+        return found.tolist()
 
 
 class _Curve(Listener):

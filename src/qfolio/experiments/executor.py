@@ -100,8 +100,8 @@ def at_once(executor: Executor, in_lockstep: int = AT_ONCE) -> int:
 
 
 ListenToJob = Callable[[Job, float, float], Sequence[Listener]]
-"""Called before each job, with the finished share of all jobs and the share of this job; returns
-the listeners of its training."""
+"""Called before each job, with the share of the whole experiment that is finished and that of this
+job; returns the listeners of its training."""
 
 
 def carry_out(
@@ -110,18 +110,23 @@ def carry_out(
     listen: ListenToJob,
     store: Callable[[Any, Any], None],
     log: Log,
+    members: int = 0,
 ) -> bool:
     """Runs jobs; returns whether Ctrl-C stopped them.
 
     store: called with each finished job and its result. log: the experiment's log; its listener
-    comes first in each job.
+    comes first in each job. members: of the experiment, if some have been trained before (default:
+    those of the jobs).
     """
-    done = 0
+    sizes = {job.name: len(job.members) for job in jobs}
+    left = sum(sizes.values())
+    whole = max(members, left)
     log.queue([job.name for job in jobs])
 
     def listeners(job: Job) -> Sequence[Listener]:
         assert isinstance(job, MembersJob)
-        return [log.job(job.name, job.members), *listen(job, done / len(jobs), 1 / len(jobs))]
+        done, share = (whole - left) / whole, sizes[job.name] / whole
+        return [log.job(job.name, job.members), *listen(job, done, share)]
 
     with (
         interruptible() as stop,
@@ -129,8 +134,8 @@ def carry_out(
     ):
         for job, result in finished:
             store(job, result)
-            done += 1
-        log.settle(done == len(jobs))
+            left -= sizes[job.name]
+        log.settle(not left)
         return stop.is_set()
 
 

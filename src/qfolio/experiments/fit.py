@@ -75,7 +75,12 @@ class Training:
     @property
     def share(self) -> float:
         """The share of this training that is done, in steps."""
-        return self.done / max(self.done + self.left, 1)
+        return self.share_since(self.begun * self.num_envs)
+
+    def share_since(self, steps: int = 0) -> float:
+        """The share that is done of what follows the first ``steps`` of a member."""
+        done = self.steps - steps
+        return done / max(done + self.left * self.num_envs, 1)
 
     @property
     def steps_per_second(self) -> float:

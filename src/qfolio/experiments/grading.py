@@ -39,18 +39,15 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
             or f"The return of seed {bad} is not finite; check the step of {task.name}."
         )
     solution = task.optimum()
-    optimum, regrets = None, None
-    if solution is not None:
-        optimum = float(solution.returns(keys).mean())
-        if optimum:  # there is no share of zero
-            regrets = regret(returns, optimum).tolist()
+    optimum = None if solution is None else float(solution.returns(keys).mean())
+    regrets = regret(returns, optimum)
     interval = mean_interval(returns)
     return {
         "return_mean": float(returns.mean()),
         "return_ci95": None if interval is None else list(interval),
         "return_per_seed": returns.tolist(),
         "optimum": optimum,
-        "regret_per_seed": regrets,
+        "regret_per_seed": None if regrets is None else regrets.tolist(),
         "overestimation_per_seed": [
             float(error) if np.isfinite(error) else None for error in played.overestimation
         ],

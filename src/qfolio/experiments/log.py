@@ -183,7 +183,7 @@ class JobLog(Listener):
         self._step, self._share = 0, 0.0  # of the previous record
 
     def on_start(self, training: Training) -> None:
-        self._step, self._share = training.steps, self._share_of(training)
+        self._step, self._share = training.steps, training.share_since(self.since)
         self.log.write(
             "running",
             job=self.name,
@@ -213,14 +213,9 @@ class JobLog(Listener):
         self.log.write("record", job=self.name, step=step, **more, values=values)
         self.log.track(self.name, step, values)
 
-    def _share_of(self, training: Training) -> float:
-        """The share of the job that is done, what was done before it was resumed included."""
-        done = training.steps - self.since
-        return done / max(done + training.left * training.num_envs, 1)
-
     def _flush(self, training: Training) -> None:
         rows, members, ends = Records.joined(self._rows), self._of, self._ends
-        step, share = training.steps, self._share_of(training)
+        step, share = training.steps, training.share_since(self.since)
         parts = math.ceil(PARTS * (share - self._share))
         for some in _parts(np.array(ends, int), parts, max(1, len(self.members))):
             at = step if some.stop == len(rows) else ends[some.stop - 1]

@@ -160,8 +160,8 @@ class Run(Seeds):
             listeners: Called at the start, after each chunk and at the end; see ``Listener``.
             executor: Where groups of seeds train (default: all side by side in this process); see
                 ``qfolio.on``.
-            listen: Called before each group, with the finished share of all groups and the share of
-                this one; returns its listeners (default: ``listeners``).
+            listen: Called before each group, with the share of all seeds that is finished and that
+                of this group; returns its listeners (default: ``listeners``).
             log: Log of the experiment that the run is a part of (default: the folder's own).
         """
         budget = self.budget if budget is None else require_budget(budget)
@@ -181,7 +181,7 @@ class Run(Seeds):
         if jobs:
             with Log(self.folder).opened(**self._about) as log:
                 store = partial(self.groups.store, log=log)
-                self.interrupted = carry_out(executor, jobs, listen, store, log)
+                self.interrupted = carry_out(executor, jobs, listen, store, log, self.config.seeds)
 
     def first_weights(self) -> Any:
         """The first seed's learned weights."""

@@ -81,6 +81,8 @@ class RunFolder:
         return read_config(self.path / CONFIG, RunConfig)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
+        """Writes the grades of the latest checkpoint; raises QfolioError if it is another one."""
+        self.require_latest()
         write_json(self.path / SUMMARY, summary)
 
     def write_checkpoint(self, state: Any, weights: Any) -> None:

@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 from numpy.typing import ArrayLike
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.mdp import Agent
+from qfolio.core.mdp import Agent, task_jit
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.market import Holding
 from qfolio.portfolio.prices.table import Prices
@@ -87,7 +86,7 @@ def _before(held: ArrayLike, after: np.ndarray) -> np.ndarray:
     return np.concatenate([np.asarray(held, after.dtype)[:, None], after[:, :-1]], axis=1)
 
 
-@eqx.filter_jit(donate="none")
+@task_jit
 def paths(
     task: Portfolio, agent: Agent, members: PyTree, first: Array, held: Holding, count: int
 ) -> tuple[

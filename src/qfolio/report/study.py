@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from qfolio.core.files import write_text
-from qfolio.core.text import amount, listed
+from qfolio.core.text import amount, listed, plural
 from qfolio.portfolio.backtest.statistics.verdict import p_text
 from qfolio.portfolio.study.evidence import Active, Evidence
 from qfolio.portfolio.study.folder import Result, StudyConfig, StudyFolder, Variant
@@ -88,6 +88,7 @@ def render_study(
     """
     main, agents = result.variants[0], " and ".join(config.agents)
     tables = len(config.tables)
+    on = next(iter(config.tables)) if tables == 1 else amount(tables, "table")
     notes: dict[str, list[str]] = {}
     for name, table in config.tables.items():
         if table.note:
@@ -96,7 +97,7 @@ def render_study(
         "study.html",
         data=config,
         result=result,
-        title=f"{agents} on {amount(tables, 'table')}",
+        title=f"{agents} on {on}",
         spelled=_spelled(main.variant),
         facts=_facts(config, result),
         looks=looks_sentence(result),
@@ -112,7 +113,8 @@ def render_study(
             for name, pools in main.agents.items()
         ],
         counted=counted(tables, "table"),
-        repeats="The same tables and seeds give the same results",
+        several=tables > 1,
+        repeats=f"The same {plural('table', tables)} and seeds give the same results",
         subject="study",
         settings=setting_groups(settings),
     )
@@ -121,12 +123,14 @@ def render_study(
 def _facts(config: StudyConfig, result: Result) -> list[tuple[str, str, str]]:
     """The key figures: name, value and a remark."""
     main = result.variants[0]
-    known = next(iter(main.agents.values())).evidence.values()
-    variants = len(config.variants)
+    known = list(next(iter(main.agents.values())).evidence.values())
+    tables, variants = len(config.tables), len(config.variants)
+    several = "all tables together"
+    tested = several if tables > 1 else rendering.years(known[0].first, known[0].last)
     earlier = f", {number(result.earlier, 0)} earlier" if result.earlier else ""
     return [
-        ("Tables", str(len(config.tables)), f"{len(config.left_out)} left out"),
-        ("Tested", f"{number(sum(one.years for one in known))} years", "all tables together"),
+        (plural("Table", tables), str(tables), f"{len(config.left_out)} left out"),
+        ("Tested", f"{number(sum(one.years for one in known))} years", tested),
         ("Folds", config.test, f"after {config.train} of training"),
         ("Cost", f"{main.variant.bps:g}{THIN_SPACE}bp", f"lag {main.variant.lag}"),
         ("Looks", number(result.looks, 0), f"{amount(variants, 'variant')}{earlier}"),
@@ -137,7 +141,7 @@ def _facts(config: StudyConfig, result: Result) -> list[tuple[str, str, str]]:
 def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
     """The rows of the forest plot, the best first, the pooled row, and the axis."""
     actives = {name: known.to_reference for name, known in pools.evidence.items()}
-    pooled = pools.to_reference
+    pooled, several = pools.to_reference, len(actives) > 1
     points = [x for one in actives.values() if (x := one.growth) is not None]
     points += [x for x in (pooled.low, pooled.growth, pooled.high, 0.0) if x is not None]
     ends = [x for one in actives.values() for x in (one.low, one.high) if x is not None]
@@ -162,7 +166,7 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
             bar=bar(one.growth, one.low, one.high),
             side=_side(one.low, one.high),
             size=round(6 + 6 * math.sqrt(known.years / longest), 1),
-            worst=len(actives) > 1 and name == pooled.worst,
+            worst=several and name == pooled.worst,
             cells=_cells(known),
             label=_label(one.growth, one.low, one.high),
         )
@@ -187,7 +191,7 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
         },
         "ticks": [(rendering.percent(tick, digits, sign=True), axis.at(tick)) for tick in ticks],
         "zero": axis.at(0.0),
-        "mean": None if pooled.growth is None else axis.at(pooled.growth),
+        "mean": axis.at(pooled.growth) if several and pooled.growth is not None else None,
         "cut": any(row.bar and (row.bar.cut_left or row.bar.cut_right) for row in rows),
     }
 

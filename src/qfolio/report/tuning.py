@@ -134,8 +134,9 @@ def _finals(data: Sweep) -> list[tuple[str, list[str]]]:
             continue
         digits = decimals(optimum or returns.mean())
         spread = over_seeds(returns, mean_interval(returns), partial(number, digits=digits))
-        missed = "–" if not optimum else percent(float(regret(returns.mean(), optimum)), 1)
-        cells = [number(returns.mean(), digits), spread, number(returns.min(), digits), missed]
+        missed = regret(returns.mean(), optimum)
+        share = "–" if missed is None else percent(float(missed), 1)
+        cells = [number(returns.mean(), digits), spread, number(returns.min(), digits), share]
         rows.append((name, cells))
     return rows
 

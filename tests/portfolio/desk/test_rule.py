@@ -12,7 +12,7 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.follow import follow
-from qfolio.portfolio.desk.rule import Rule
+from qfolio.portfolio.desk.rule import Ordered, Rule
 from qfolio.portfolio.desk.standing import Standing
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
@@ -87,6 +87,35 @@ def test_an_asset_as_benchmark_gets_everything(desk):
         "These are the weights of 60/40 of 2020-05-10, its latest up to 2020-06-08 in the "
         "backtest's copy, which ends on 2020-05-10."
     ]
+
+
+def test_an_order_that_trades_too_much_or_too_little_is_named(tmp_path):
+    """The latest order is half in A and a tenth in B; the year allows a turnover of 0.5."""
+    Backtest.create(
+        table(), AGENTS, out=tmp_path / "run", train="100d", test="60d", seeds=1,
+        strategies={"60/40": WEIGHTS},
+        mandate={"trading": {"turnover": 0.5, "turnover_a_year": 0.5, "smallest_trade": 0.01}},
+    )  # fmt: skip
+    strategy = Desk.open(tmp_path / "run").followed("60/40")
+    assert isinstance(strategy, Ordered)
+
+    def said(held, spent=0.0):
+        _, *broken = strategy.notes(table(), np.array(held), spent=spent)
+        return " ".join(broken).removesuffix(
+            "), and are carried out all the same, as in the backtest."
+        )
+
+    assert said([0.4, 0.5, 0.1, 0.0], spent=0.5) == ""
+    assert said([1.0, 0.0, 0.0, 0.0]) == (
+        "They break the mandate (turnover is too high by 0.1, turnover of the year is too high by "
+        "0.1"
+    )
+    assert said([0.6, 0.3, 0.1, 0.0], spent=0.4) == (
+        "They break the mandate (turnover of the year is too high by 0.1"
+    )
+    assert said([0.396, 0.504, 0.1, 0.0]) == (
+        "They break the mandate (a trade is too small by 0.006"
+    )
 
 
 @pytest.mark.parametrize(("name", "kind"), [("fund", "returns"), ("index", "levels")])

@@ -240,7 +240,10 @@ def test_points_that_may_be_either(tmp_path: Path):
     for mark in ";\t|":
         said = refusal(write(tmp_path, f"date{mark}A{mark}B\n" + rows(ISO, cells, mark)))
         assert "'1.234' may mean 1234 or 1.234, and no other number tells which" in said
-        assert "separate the columns by commas" in said
+        assert "leave such points out if they mark thousands" in said
+        assert "separate the columns by commas if they mark decimals" in said
+        whole = f"date{mark}A{mark}B\n" + rows(ISO, cells, mark).replace(".", "")
+        assert load(write(tmp_path, whole)).values[0].tolist() == [1234, 900]
     text = "date,A,B\n" + rows(ISO, cells)
     assert load(write(tmp_path, text)).values[0].tolist() == [1.234, 900]
     cells[0][1] = "900.5"
@@ -379,6 +382,7 @@ def test_a_folder_has_the_warnings_of_its_files(tmp_path: Path):
     (tmp_path / "b.csv").write_text(text)
     said = [str(each) for each in inspect(tmp_path)[1]]
     assert "column 'currency': in 'b.csv': there are several currencies: EUR and USD" in said
+    assert sum("currencies" in each for each in said) == 1
 
 
 def test_the_files_of_a_folder_have_one_currency(tmp_path: Path):

@@ -128,6 +128,24 @@ def test_returns_are_told_from_prices():
 # Columns of the whole market.
 
 
+@pytest.mark.parametrize("name", ["return", "Returns", "RET"])
+@pytest.mark.parametrize("assets", [["A", "B", "C"], [700, 5, 9988]])
+def test_a_long_table_may_call_its_values_returns(name: str, assets: list):
+    rates = prices().pct_change().iloc[1:]
+    table = rates.set_axis(assets, axis=1).rename_axis("date").reset_index()
+    table = table.melt("date", var_name="ticker", value_name=name)
+    back = load(table, returns="fraction")
+    assert back.assets == tuple(map(str, assets))
+    np.testing.assert_allclose(back.relatives, 1 + rates.to_numpy()[1:], rtol=1e-12)
+    table[name] = abs(table[name])  # not even then are they prices
+    (error,) = findings(table, "error")
+    assert str(error) == f"column {name!r}: holds returns, but no column is called price or close"
+    assert "returns='percent' or 'fraction' (--returns)" in error.advice
+    closes = table.assign(close=prices().to_numpy()[1:].T.ravel())
+    np.testing.assert_allclose(load(closes).values, prices().to_numpy()[1:])
+    assert load(closes, returns="fraction").values.max() < 1000  # not of the closes
+
+
 def test_a_column_of_the_market():
     table = prices()
     table.insert(1, "rate", np.linspace(0.01, 0.05, ROWS))

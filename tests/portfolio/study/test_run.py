@@ -63,13 +63,19 @@ def test_a_study_killed_and_resumed_equals_an_undisturbed_one(finished, tmp_path
     with pytest.raises(QfolioError, match="not finished; continue with qfolio study --resume"):
         again.result()
     assert 0 < len(again.config.looks) < 4
-    trained = []
+    trained, shares = [], []
+
+    def note(job, done, share):
+        shares.append((done, share))
+        return ()
 
     def listen(name, variant, backtest):
         trained.append((name, variant))
-        return lambda job, done, share: ()
+        return note
 
     again.run(listen)
+    assert 0 < shares[0][0] < 1  # of the whole backtest, with what was trained before
+    assert sum(shares[-1]) == pytest.approx(1)
     left = [place for place in finished.places if place not in finished.places[: 4 - len(trained)]]
     assert trained == left  # finished tables are not run again
     assert again.result() == finished.config.result
@@ -106,6 +112,18 @@ def test_a_study_shows_itself_in_a_notebook(finished, tmp_path):
     assert "4 of 4 backtests finished" in shown
     assert f"<td>{pooled.z:+.2f}</td>".replace("-", "−") in shown
     assert "0 of 2 backtests finished" in create(tmp_path / "new")._repr_html_()
+    config, result = study(1)
+    alone = Study(msgspec.structs.replace(config, result=result), tmp_path)._repr_html_()
+    assert ("pooled, a year, net" in shown, "pooled" in alone) == (True, False)
+    assert "a year, net" in alone
+
+
+def test_names_of_tables_may_have_any_letters(tmp_path):
+    named = {"börse": TABLES["one"], "株価": TABLES["two"]}
+    create(tmp_path / "study", named)
+    again = Study.open(tmp_path / "study")
+    assert list(again.config.tables) == list(named)
+    assert again.backtest("株価").prices.digest == TABLES["two"].digest
 
 
 def test_each_table_is_an_ordinary_backtest(finished):

@@ -7,8 +7,8 @@ from qfolio.portfolio.study.verdict import verdicts
 ACTIVE = {"growth": 0.01, "low": 0.0, "high": 0.02, "tracking_error": 0.02, "t": 1.0, "z": 1.0}
 
 
-def pools(reference, alone, best):
-    """Pools of one table, with findings against the reference and its best rebalancing."""
+def pools(reference, alone, best, tables=("us", "eu")):
+    """Pools with findings against the reference and its best rebalancing."""
     active = Active(reference=reference, information_ratio=0.5, **ACTIVE)
     known = Evidence(
         first="2001-01-02", last="2002-12-31", days=500, years=2.0, to_reference=active,
@@ -23,7 +23,7 @@ def pools(reference, alone, best):
         )  # fmt: skip
 
     return Pools(
-        evidence={"us": known},
+        evidence=dict.fromkeys(tables, known),
         to_reference=pooled(0.03, alone),
         to_rebalanced=pooled(0.02, best),
         sharpe=PooledSharpe(difference=-0.1, z=-0.5, positive=0),
@@ -36,8 +36,8 @@ def pools(reference, alone, best):
         (
             "better",
             "better",
-            "tilts beats equal-weight, however it is rebalanced, in growth after costs over 1 "
-            "table: the mean difference in annual growth is +2.00%",
+            "tilts beats equal-weight, however it is rebalanced, in growth after costs over 2 "
+            "tables: the mean difference in annual growth is +2.00%",
             "Against equal-weight itself, rebalanced as often as it may be: the mean difference "
             "in annual growth is +3.00%",
         ),
@@ -46,14 +46,14 @@ def pools(reference, alone, best):
             "better",
             "none",
             "No evidence that tilts beats the best rebalancing of equal-weight in growth after "
-            "costs over 1 table: the mean difference in annual growth is +2.00%",
+            "costs over 2 tables: the mean difference in annual growth is +2.00%",
             "It beats equal-weight itself, as trading less may do without any skill: the mean "
             "difference in annual growth is +3.00%",
         ),
         (
             "worse",
             "none",
-            "tilts falls short of equal-weight in growth after costs over 1 table: the mean "
+            "tilts falls short of equal-weight in growth after costs over 2 tables: the mean "
             "difference in annual growth is +3.00%",
             "Against the best rebalancing of equal-weight: the mean difference in annual growth "
             "is +2.00%",
@@ -61,7 +61,7 @@ def pools(reference, alone, best):
         (
             "none",
             "none",
-            "No evidence that tilts beats equal-weight in growth after costs over 1 table: the "
+            "No evidence that tilts beats equal-weight in growth after costs over 2 tables: the "
             "mean difference in annual growth is +3.00%",
             "Against the best rebalancing of equal-weight: the mean difference in annual growth "
             "is +2.00%",
@@ -74,12 +74,20 @@ def test_equal_weights_count_as_beaten_only_at_every_speed(alone, best, first, s
     assert said[1].startswith(second)
     assert len(said) == 4
     assert said[3] == (
-        "Its Sharpe ratio less that of the best baseline is −0.10 (Stouffer’s z −0.50); it is "
-        "higher on 0 of 1 table."
+        "Its Sharpe ratio less that of each table’s best baseline, seen in hindsight, is −0.10 on "
+        "average (Stouffer’s z −0.50); it is higher on 0 of 2 tables."
     )
 
 
 def test_another_reference_has_one_speed():
     said = verdicts({"tilts": pools("fund", "better", "better")})["tilts"]
-    assert said[0].startswith("tilts beats fund in growth after costs over 1 table: ")
+    assert said[0].startswith("tilts beats fund in growth after costs over 2 tables: ")
     assert len(said) == 3
+
+
+def test_a_table_alone_is_named_and_not_pooled():
+    assert verdicts({"tilts": pools("fund", "better", "better", ["us"])})["tilts"] == [
+        "tilts beats fund in growth after costs on us: the difference in annual growth is +3.00% "
+        "(95% interval +2.00% to +4.00%); z is +3.00, corrected p = 0.020.",
+        "Its Sharpe ratio less that of the best baseline, seen in hindsight, is −0.10 (z −0.50).",
+    ]

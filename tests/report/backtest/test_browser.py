@@ -13,7 +13,7 @@ from qfolio.report.backtest.opening import lead_name
 from qfolio.report.backtest.page import render_backtest
 from qfolio.report.printing import find_browser, print_pdf
 
-from backtests import ATTACK, usual
+from backtests import ATTACK, make_data, usual
 from browser import Browser
 
 DRAWN = "location.protocol === 'file:' && document.querySelectorAll('.chart .main-svg').length >= 3"
@@ -122,6 +122,30 @@ def test_the_ends_of_long_names_are_seen(browser: Browser, tmp_path: Path, width
     seen = "row.lastChild.getBoundingClientRect().right <= row.getBoundingClientRect().right + 1"
     assert browser.evaluate(f"{rows}.every(row => {seen})")
     assert browser.evaluate(f"{rows}.every(row => row.scrollWidth <= row.clientWidth)")
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_long_names_fit_beside_the_ends_of_lines(
+    browser: Browser, tmp_path: Path, width: int
+) -> None:
+    data = usual(60)
+    names = {
+        "best of all": "equal-weight-1-percent-a-day",
+        "DQN": "tilts:low-risk",
+        "DQN-together": "tilts:low-risk, seeds together",
+    }
+    series = {names.get(name, name): each for name, each in data.strategies.items()}
+    page = render_backtest(make_data(series, data.dates, data.assets))
+    (tmp_path / "report.html").write_text(page, encoding="utf-8")
+    browser.show((tmp_path / "report.html").as_uri(), width, DRAWN, phone=width < 500)
+    labels = "[...document.querySelectorAll('#wealth-labels span')]"
+    assert {*names.values()} <= set(browser.evaluate(f"{labels}.map(each => each.textContent)"))
+    cut = "each.scrollWidth > each.clientWidth || each.scrollHeight > each.clientHeight"
+    assert browser.evaluate(f"{labels}.filter(each => {cut}).map(each => each.textContent)") == []
+    boxes = f"{labels}.map(each => each.getBoundingClientRect()).sort((a, b) => a.top - b.top)"
+    apart = "(box, i, all) => !i || box.top > all[i - 1].bottom - 1"
+    assert browser.evaluate(f"{boxes}.every({apart})")
+    assert browser.evaluate(f"{boxes}.every(box => box.right <= innerWidth)")
 
 
 OVERLAPS = """

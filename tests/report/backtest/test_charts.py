@@ -10,6 +10,8 @@ from qfolio.report.backtest.charts import POINTS
 from qfolio.report.backtest.data import BacktestData, shown_order
 from qfolio.report.backtest.holdings import BLOCKS, NAMED
 from qfolio.report.backtest.page import render_backtest, write_backtest_report
+from qfolio.report.backtest.wealth import draw_wealth
+from qfolio.report.figures.style import LEAD
 
 from backtests import Page, make_data, make_series, usual
 from tables import weekdays
@@ -36,6 +38,17 @@ def test_numbers_of_the_charts(data: BacktestData, page: Page) -> None:
     looks = [(s["symbol"], s["dash"]) for s in chart["strategies"]]
     assert len(set(looks)) == len(looks)
     assert dqn["width"] == pathwise["width"] > max(s["width"] for s in chart["strategies"][3:])
+
+
+def test_a_long_name_leaves_the_picture_its_room() -> None:
+    data = usual(60)
+    long = "A strategy of our own with a long name, which was revised in the autumn by the desk"
+    series = {long if name == "DQN" else name: each for name, each in data.strategies.items()}
+    figure = draw_wealth(make_data(series, data.dates, data.assets), LEAD)
+    figure.draw_without_rendering()
+    assert figure.axes[0].get_position().width > 0.6
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert long in [name.replace("\n", " ") for name in names]
 
 
 def test_weights_are_grouped_and_add_up() -> None:

@@ -28,27 +28,33 @@ def spell(variant: "Variant") -> str:
 
 
 def print_study(result: "Result") -> None:
-    """A row for each table and each variant pooled, by agent, and the verdicts."""
+    """A row for each table and each variant pooled, by agent, and the verdicts.
+
+    Of a table alone nothing is pooled: it has a row in each variant.
+    """
     from qfolio.portfolio.study.verdict import decimal, looks_sentence
 
     main, *_ = result.variants
-    for agent, pools in main.agents.items():
+    several = len(next(iter(main.agents.values())).evidence) > 1
+    for agent in main.agents:
         rows: list[tuple[str, ...]] = []
-        for name, known in pools.evidence.items():
-            active = known.to_reference
-            ratios = (active.information_ratio, active.t, known.to_rebalanced.t, known.sharpe)
-            rows.append((name, *_growth(active), *map(decimal, ratios)))
-        for entry in result.variants:
+        for entry in [main] if several else result.variants:
+            for name, known in entry.agents[agent].evidence.items():
+                active = known.to_reference
+                ratios = (active.information_ratio, active.t, known.to_rebalanced.t, known.sharpe)
+                label = name if entry is main else f"{name}, {spell(entry.variant)}"
+                rows.append((label, *_growth(active), *map(decimal, ratios)))
+        for entry in result.variants if several else []:
             found = entry.agents[agent]
             numbers = (found.to_reference.z, found.to_rebalanced.z, found.sharpe.difference)
             cells = (*_growth(found.to_reference), "", *map(decimal, numbers))
             rows.append((_pooled(entry.variant), *cells))
         heads = (agent, "a year", "95% interval", "IR", "t", "rebal.", "Sharpe")
         print_table(heads, rows, bold=[_pooled(main.variant)])
+    pooled, or_z = (" (pooled: Stouffer's z)", " (or z)") if several else ("", "")
     say(
-        "“a year” is growth less the benchmark's, and t tests it (pooled: Stouffer's z); “rebal.” "
-        "is the t (or z) against its best rebalancing; Sharpe is the ratio less the highest of a "
-        "baseline."
+        f"“a year” is growth less the benchmark's, and t tests it{pooled}; “rebal.” is the t{or_z} "
+        "against its best rebalancing; Sharpe is the ratio less the highest of a baseline."
     )
     for sentences in result.verdicts.values():
         for sentence in sentences:

@@ -84,7 +84,8 @@ def rank(results: dict[str, Result]) -> dict[str, Any]:
     agents, best first; "agents" holds the measures of each, "pairs" the tests of all pairs.
     "common_steps" is the shortest training, up to which "area" averages the learning curves.
     """
-    graded = all(result.optimum for result in results.values())  # there is no share of zero
+    # There is no share of zero.
+    graded = all(result.optimum and result.curve_optimum for result in results.values())
     sign = -1.0 if graded else 1.0  # a large score is good
     scores = {name: sign * _final(result, graded) for name, result in results.items()}
     goal = max(float(interquartile_mean(result.curve_returns[-1])) for result in results.values())
@@ -110,8 +111,9 @@ def curve(result: Result, measure: str) -> Floats:
     """The learning curve of each seed in the ranking's measure, of shape (point, seed)."""
     if measure == "return":
         return np.asarray(result.curve_returns, dtype=float)
-    assert result.curve_optimum is not None
-    return regret(result.curve_returns, result.curve_optimum)
+    missed = regret(result.curve_returns, result.curve_optimum)
+    assert missed is not None
+    return missed
 
 
 def steps_within(steps: Sequence[int], regrets: Floats, threshold: float) -> list[int | None]:
@@ -153,10 +155,11 @@ def fewest_seeds(pairs: int) -> int:
 
 
 def _final(result: Result, graded: bool) -> Floats:
-    if graded:
-        assert result.optimum is not None
-        return regret(result.returns, result.optimum)
-    return np.asarray(result.returns, dtype=float)
+    if not graded:
+        return np.asarray(result.returns, dtype=float)
+    missed = regret(result.returns, result.optimum)
+    assert missed is not None
+    return missed
 
 
 def _measures(
@@ -167,7 +170,7 @@ def _measures(
     final: regrets or returns of the seeds. goal: the best return, if no optimum is known.
     """
     returns = np.asarray(result.curve_returns, dtype=float)
-    optimum = result.curve_optimum if graded and result.curve_optimum else goal
+    missed = regret(returns, result.curve_optimum if graded else goal)
     heights = curve(result, "regret" if graded else "return")
     areas = area(result.curve_steps, heights, common)
     return {
@@ -178,9 +181,7 @@ def _measures(
             "per_seed": final.tolist(),
         },
         "area": _spread(areas),
-        "within": [
-            _within(result, regret(returns, optimum), threshold) for threshold in THRESHOLDS
-        ],
+        "within": [_within(result, missed, threshold) for threshold in THRESHOLDS],
     }
 
 
@@ -190,8 +191,11 @@ def _spread(values: Floats) -> dict[str, Any]:
     return {"iqm": float(interquartile_mean(values)), "interval": interval}
 
 
-def _within(result: Result, regrets: Floats, threshold: float) -> dict[str, Any]:
-    steps = steps_within(result.curve_steps, regrets, threshold)
+def _within(result: Result, regrets: Floats | None, threshold: float) -> dict[str, Any]:
+    """When the seeds come and stay within a threshold; never, if there are no regrets."""
+    steps: list[int | None] = [None] * len(result.returns)
+    if regrets is not None:
+        steps = steps_within(result.curve_steps, regrets, threshold)
     middle = middle_steps(steps)
     pace = result.seconds_per_seed / max(result.env_steps, 1)
     return {

@@ -238,7 +238,8 @@ class Comparison:
 
         Args:
             listen: Called before each job, which is an agent or a group of its seeds, with the
-                finished share of all jobs and the share of this job; returns its listeners.
+                share of the comparison that is finished and that of this job; returns its
+                listeners.
             executor: Where groups of seeds train (default: one agent after another in this
                 process); see ``qfolio.on``.
         """
@@ -265,6 +266,11 @@ class Comparison:
             "seeds": config.seeds,
         }
 
+    @property
+    def _members(self) -> int:
+        """The seeds of all agents."""
+        return len(self.entrants) * self.config.seeds
+
     def _run_here(
         self, missing: list[str], executor: Executor, listen: ListenToJob, log: Log
     ) -> bool:
@@ -278,7 +284,7 @@ class Comparison:
             else:
                 self._keep(job.name, trained, executor, log)
 
-        return carry_out(executor, jobs, listen, store, log)
+        return carry_out(executor, jobs, listen, store, log, self._members)
 
     def _run_groups(
         self, missing: list[str], executor: Executor, listen: ListenToJob, log: Log
@@ -303,7 +309,7 @@ class Comparison:
                 stack.enter_context(locked(self.place(name)))
                 jobs += runs[name].groups.jobs(executor, label=name)
                 keep_if_finished(name)  # all seeds may be trained, with only the result missing
-            return carry_out(executor, jobs, listen, store, log)
+            return carry_out(executor, jobs, listen, store, log, self._members)
 
     def _fail(self, job: str, name: str, error: QfolioError, log: Log) -> None:
         self.failures[name] = str(error)
@@ -442,9 +448,10 @@ def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
 
 def _measures(result: Result) -> dict[str, float | None]:
     """The measures of a result in the log: interquartile means over seeds, as in the ranking."""
-    final, optimum = float(interquartile_mean(result.returns)), result.optimum
-    missed = None if not optimum else float(regret(final, optimum))
-    return {"return": final, "optimum": optimum, "regret": missed}
+    final = float(interquartile_mean(result.returns))
+    missed = regret(final, result.optimum)
+    known = {"return": final, "optimum": result.optimum}
+    return {**known, "regret": None if missed is None else float(missed)}
 
 
 def _same(first: Any, second: Any) -> bool:

@@ -318,6 +318,11 @@ class Backtest:
         return card(f"Backtest of {' and '.join(self.agents)}", facts, header, rows)
 
     @property
+    def members(self) -> int:
+        """How many policies are trained in all: one for each agent, training window and seed."""
+        return len(self.agents) * len(self._plan.trainings) * self.config.seeds
+
+    @property
     def folder(self) -> Path | None:
         """The folder of the backtest, if it has one."""
         return None if self._kept.folder is None else self._kept.folder.path
@@ -333,8 +338,8 @@ class Backtest:
         folds are kept.
 
         Args:
-            listen: Called before each job, with the finished share of all jobs and the share of
-                this job; returns the listeners of its training.
+            listen: Called before each job, with the share of the backtest that is finished and that
+                of this job; returns the listeners of its training.
             executor: Where the jobs run (default: in this process); see ``qfolio.on``.
         """
         executor = on(executor)
@@ -348,7 +353,7 @@ class Backtest:
         with lock, ahead, Log(self.folder).opened(**self._about) as log:
             if self.folder is not None:
                 tidy(self.folder)
-            self.interrupted = carry_out(executor, jobs, listen, self.store, log)
+            self.interrupted = carry_out(executor, jobs, listen, self.store, log, self.members)
 
     @property
     def _counts(self) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.folds import latest
@@ -55,8 +56,11 @@ class Untrained(abc.ABC):
         QfolioError if the table's assets are not the backtest's, or there is nothing to order.
         """
 
-    def notes(self, prices: Any) -> list[str]:
-        """Sentences on the order after the last row."""
+    def notes(self, prices: Any, held: Floats | None = None, *, spent: float = 0.0) -> list[str]:
+        """Sentences on the order after the last row.
+
+        held: the weights now, cash first. spent: as for ``weights``.
+        """
         return []
 
 
@@ -138,9 +142,7 @@ class Ordered(Untrained):
     def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:
         """The weights of the latest order; those of delisted assets are in cash."""
         table = self.table(prices)
-        target = self.own.values[self._latest(table)]
-        if table.listed is not None:
-            target = cashed(target, table.listed[-1])
+        target = self._target(table)
         unpriced = (target[1:] != 0) & np.isnan(table.values[-1])
         if unpriced.any():
             raise QfolioError(
@@ -149,8 +151,11 @@ class Ordered(Untrained):
             )
         return dict(zip(("cash", *self.assets), target.tolist(), strict=True))
 
-    def notes(self, prices: Any) -> list[str]:
-        """Says of which date the order is, and where it breaks the mandate."""
+    def notes(self, prices: Any, held: Floats | None = None, *, spent: float = 0.0) -> list[str]:
+        """Says of which date the order is, and where it breaks the mandate, but for risk.
+
+        Without the weights held, turnover and the smallest trade are not checked.
+        """
         table = self.table(prices)
         latest, last = self._latest(table), day(table.dates[-1])
         ordered = day(self.own.dates[latest])
@@ -161,7 +166,13 @@ class Ordered(Untrained):
         if self.mandate:
             there = ~np.isnan(table.values[-1])
             mandated, _ = checks.relaxed(feasible(self.mandate, there, self.cap))
-            found = mandated.violations(self.own.values[latest])
+            target = self._target(table)
+            found = mandated.violations(target, held)
+            if held is not None:
+                left = self.task.terms.unspent(self.task.terms.begin(held, spent))
+                if left is not None:
+                    change = abs(target - held)[1:].sum()
+                    found["turnover of the year is too high by"] = change - left
             broken = [f"{what} {by:.2g}" for what, by in found.items() if by > TOLERANCE]
             if broken:
                 said.append(
@@ -169,6 +180,11 @@ class Ordered(Untrained):
                     "same, as in the backtest."
                 )
         return said
+
+    def _target(self, table: Prices) -> Floats:
+        """The weights of the latest order, cash first."""
+        target = self.own.values[self._latest(table)]
+        return target if table.listed is None else cashed(target, table.listed[-1])
 
     def _latest(self, table: Prices) -> int:
         """Number of the latest order; one on a day without a row counts at the next row."""

@@ -78,7 +78,8 @@ def cells(table: Table, choices: Choices) -> tuple[Grid | None, Findings]:
     """The cells by date and asset before gaps are treated (None if rows or columns have errors)."""
     findings = Findings()
     features, shared = tuple(choices.features), choices.own_columns
-    columns = find_columns(table, features, shared, choices.date, findings)
+    returns = choices.returns is not None
+    columns = find_columns(table, features, shared, choices.date, findings, returns=returns)
     grid = None if columns is None else arrange(table, columns, findings)
     if grid is None:
         return None, findings

@@ -16,6 +16,7 @@ from qfolio.portfolio.prices.vocabulary import (
     ASSET_NAMES,
     DATE_NAMES,
     PRICE_NAMES,
+    RETURN_NAMES,
     plain,
 )
 
@@ -63,10 +64,13 @@ def find_columns(
     shared: tuple[str, ...],
     date: str | None,
     findings: Findings,
+    *,
+    returns: bool = False,
 ) -> Columns | None:
     """The columns that matter; None after an error.
 
-    shared: columns of the whole market, which come after the features.
+    shared: columns of the whole market, which come after the features. returns: whether the table
+    holds returns in place of prices.
     """
     columns = _check_names(table, features, shared, date, findings)
     features += shared
@@ -91,7 +95,7 @@ def find_columns(
     channels = {j for name in features for j in by_asset[name].values()}
     channels |= {single[name] for name in features if name in single}
     others = [j for j in columns if j not in channels]
-    label, price = _long_columns(table, others, when, findings)
+    label, price = _long_columns(table, others, when, findings, returns=returns)
     if findings.bad:
         return None
     if label is not None and price is not None:
@@ -195,7 +199,7 @@ def _time_column(table: Table, columns: list[int], when: int) -> int | None:
 
 
 def _long_columns(
-    table: Table, columns: list[int], when: int, findings: Findings
+    table: Table, columns: list[int], when: int, findings: Findings, *, returns: bool
 ) -> tuple[int | None, int | None]:
     """The columns of assets and of prices in a long table; (None, None) in a wide one.
 
@@ -203,9 +207,9 @@ def _long_columns(
     """
     names = {j: plain(table.names[j]) for j in columns}
     assets = [j for j in columns if names[j] in ASSET_NAMES]
-    prices = [j for j in columns if names[j] in ADJUSTED_NAMES] or [
-        j for j in columns if names[j] in PRICE_NAMES
-    ]
+    order = [ADJUSTED_NAMES, PRICE_NAMES]
+    order.insert(0 if returns else 2, RETURN_NAMES)
+    prices = next(filter(None, ([j for j in columns if names[j] in each] for each in order)), [])
     if not assets or not prices:
         return None, None
     labels = [j for j in assets if _are_labels(table.columns[j])]
@@ -213,6 +217,13 @@ def _long_columns(
     known = moments[~np.isnat(moments)]
     if not labels and len(np.unique(known)) == len(known):
         return None, None
+    if names[prices[0]] in RETURN_NAMES and not returns:
+        findings.error(
+            "holds returns, but no column is called price or close",
+            column=table.names[prices[0]],
+            advice="Choose returns='percent' or 'fraction' (--returns), or name the column of "
+            "prices 'price'.",
+        )
     for what, found in (("assets", labels or assets), ("prices", prices)):
         if len(found) > 1:
             listed = " and ".join(quote(table.names[j]) for j in found)

@@ -69,8 +69,8 @@ def from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set[
     if unclear:
         raise QfolioError(
             f"{quote(name)}: {quote(unclear)} may mean {unclear.replace('.', '')} or {unclear}, "
-            "and no other number tells which; write another number of decimals, or separate the "
-            "columns by commas."
+            "and no other number tells which; leave such points out if they mark thousands, or "
+            "separate the columns by commas if they mark decimals."
         )
     return table
 

@@ -52,7 +52,11 @@ def join(
             for channel, block in zip(channels, grid.features, strict=True):
                 columns[channel] = block.values[:, j if block.by_asset else 0]
             parts.append(pd.DataFrame(columns))
-    check_currencies(tables, findings)
+    together = Findings()
+    check_currencies(tables, together)
+    for finding in together:  # a file that has them all is named already
+        if not any(one.message.endswith(finding.message) for one in findings):
+            findings.append(finding)
     frame = pd.concat(parts, ignore_index=True)
     filled = frame.iloc[:, 2:].notna().any(axis=1)
     frame = frame[filled | ~frame.duplicated(["date", "ticker"], keep=False)]

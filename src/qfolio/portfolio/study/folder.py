@@ -22,7 +22,7 @@ from qfolio.portfolio.study.pooling import Pools
 
 FILE = "study.json"
 
-NAME = r"^[A-Za-z0-9_-]+$"
+NAME = r"^[\w-]+$"
 """The names of tables, which become folders."""
 
 TableName = Annotated[str, msgspec.Meta(pattern=NAME)]

@@ -44,7 +44,7 @@ class Pooled(msgspec.Struct, frozen=True, kw_only=True):
     """What all tables say about one agent against one reference."""
 
     growth: float | None  # mean over tables of the annual active growth
-    low: float | None  # 95% interval by the hierarchical bootstrap
+    low: float | None  # 95% interval by the hierarchical bootstrap; one table alone keeps its own
     high: float | None
     z: float | None  # Stouffer's
     p: float | None  # two-sided; against rebalancings only the claim "better" is tested
@@ -143,7 +143,10 @@ def _pooled(
     growth = {name: _known(each.growth) for name, each in tables.items()}
     mean = float(np.mean(list(growth.values())))
     low, high = np.full(2, math.nan)
-    if math.isfinite(mean):
+    if len(tables) == 1:  # nothing is pooled, and the table has an interval of its own
+        (only,) = tables.values()
+        low, high = _known(only.low), _known(only.high)
+    elif math.isfinite(mean):
         # The bootstrap draws tables independently; common shocks widen the interval.
         errors = np.array([_known(x.tracking_error) for x in tables.values()]) / weights
         wider = math.sqrt(ratio_or_zero(errors @ shared @ errors, errors @ errors))

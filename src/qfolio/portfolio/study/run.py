@@ -209,7 +209,8 @@ class Study:
             f"{len(config.looks)} of {amount(len(self.places), 'backtest')} finished",
             str(self.folder),
         ]
-        header = ("pooled, a year, net", "less the benchmark", "z", "")
+        pooled = "pooled, " if len(config.tables) > 1 else ""
+        header = (f"{pooled}a year, net", "less the benchmark", "z", "")
         return card(f"Study of {' and '.join(config.agents)}", facts, header, rows)
 
     @property

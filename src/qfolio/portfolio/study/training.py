@@ -34,12 +34,11 @@ class PlacedJob:
 
 @dataclass
 class Place:
-    """A backtest in training, with the numbers of all its jobs and of those that are left."""
+    """A backtest in training, and how many of its members are left."""
 
     table: str
     variant: Variant
     backtest: Backtest
-    count: int
     left: int
     listen: ListenToJob | None = None
 
@@ -69,7 +68,7 @@ class Trainings:
             with of_table(table):
                 backtest = self._open(table, variant)
             made = [PlacedJob(table, variant, job) for job in backtest.jobs(self._executor)]
-            place = Place(table, variant, backtest, len(made), len(made))
+            place = Place(table, variant, backtest, sum(len(job.job.members) for job in made))
             self._of.update((job.name, place) for job in made)
             self._log.queue([job.name for job in made])
             yield from made
@@ -83,14 +82,16 @@ class Trainings:
         place = self._of[job.name]
         if place.listen is None:
             place.listen = self._listen(place.table, place.variant, place.backtest)
-        return [log, *place.listen(job.job, 1 - place.left / place.count, 1 / place.count)]
+        whole = place.backtest.members
+        done, share = (whole - place.left) / whole, len(job.job.members) / whole
+        return [log, *place.listen(job.job, done, share)]
 
     def store(self, job: Job[dict[str, TrainedFold]], trained: dict[str, TrainedFold]) -> Place:
         """Keeps what a job has trained, and returns its backtest's place."""
         assert isinstance(job, PlacedJob)
         place = self._of.pop(job.name)
         place.backtest.store(job.job, trained)
-        place.left -= 1
+        place.left -= len(job.job.members)
         return place
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from qfolio.core.text import amount, figure
+from qfolio.core.text import amount, figure, plural
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT
 from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
 from qfolio.portfolio.backtest.statistics.verdict import p_text
@@ -18,7 +18,7 @@ def verdicts(agents: Mapping[str, Pools], threshold: float = 0.0) -> dict[str, l
     threshold: the z that luck is expected to reach after all looks.
     """
     return {
-        name: [*_findings(name, pools, threshold), _tables(pools), _sharpe(pools)]
+        name: [*_findings(name, pools, threshold), *_tables(pools), _sharpe(pools)]
         for name, pools in agents.items()
     }
 
@@ -30,8 +30,10 @@ def _findings(name: str, pools: Pools, threshold: float) -> list[str]:
     alone is therefore no claim: an agent that merely trades less does so on random walks.
     """
     reference, alone, best = _reference(pools), pools.to_reference, pools.to_rebalanced
-    of_alone, of_best = _numbers(alone, threshold), _numbers(best, threshold)
-    where = f"in growth after costs over {amount(len(pools.evidence), 'table')}"
+    total = len(pools.evidence)
+    of_alone, of_best = (_numbers(each, threshold, total) for each in (alone, best))
+    over = f"on {next(iter(pools.evidence))}" if total == 1 else f"over {amount(total, 'table')}"
+    where = f"in growth after costs {over}"
     found = f"{_VERBS[alone.finding or 'none'].format(name)} {reference} {where}"
     if reference != EQUAL_WEIGHT:
         return [f"{found}: {of_alone}."]
@@ -51,48 +53,59 @@ def _reference(pools: Pools) -> str:
     return next(iter(pools.evidence.values())).to_reference.reference
 
 
-def _numbers(pooled: Pooled, threshold: float) -> str:
+def _numbers(pooled: Pooled, threshold: float, tables: int) -> str:
     interval = f"95% interval {percent(pooled.low)} to {percent(pooled.high)}"
     chance = "" if pooled.p_holm is None else f", corrected p {p_text(pooled.p_holm)}"
     if pooled.finding == "none" and pooled.p_holm is not None and pooled.p_holm <= 1 - LEVEL:
         chance += f", but luck is expected to reach a z of {decimal(threshold)} after all looks"
+    difference, z = ("difference", "z") if tables == 1 else ("mean difference", "Stouffer’s z")
     return (
-        f"the mean difference in annual growth is {percent(pooled.growth)} ({interval}); "
-        f"Stouffer’s z is {decimal(pooled.z)}{chance}"
+        f"the {difference} in annual growth is {percent(pooled.growth)} ({interval}); "
+        f"{z} is {decimal(pooled.z)}{chance}"
     )
 
 
-def _tables(pools: Pools) -> str:
+def _tables(pools: Pools) -> list[str]:
+    """On how many tables it grew more, and the worst; nothing on a table alone."""
+    if len(pools.evidence) == 1:
+        return []
     worst = pools.evidence[pools.to_reference.worst].to_reference
     count, total = pools.to_reference.positive, len(pools.evidence)
     grew = f"It grew more than {worst.reference} on {count} of {amount(total, 'table')}"
     if worst.reference == EQUAL_WEIGHT:
         grew += f", and more than its best rebalancing on {pools.to_rebalanced.positive}"
-    return (
+    return [
         f"{grew}. Its worst table is {pools.to_reference.worst} ({percent(worst.growth)} a year)."
-    )
+    ]
 
 
 def _sharpe(pools: Pools) -> str:
     sharpe, total = pools.sharpe, len(pools.evidence)
-    best = "the best baseline" if total == 1 else "each table’s best baseline, seen in hindsight,"
+    difference, z = decimal(sharpe.difference), decimal(sharpe.z)
+    if total == 1:
+        return (
+            "Its Sharpe ratio less that of the best baseline, seen in hindsight, is "
+            f"{difference} (z {z})."
+        )
     return (
-        f"Its Sharpe ratio less that of {best} is {decimal(sharpe.difference)}"
-        f"{'' if total == 1 else ' on average'} (Stouffer’s z {decimal(sharpe.z)}); it is higher "
-        f"on {sharpe.positive} of {amount(total, 'table')}."
+        "Its Sharpe ratio less that of each table’s best baseline, seen in hindsight, is "
+        f"{difference} on average (Stouffer’s z {z}); it is higher on {sharpe.positive} of "
+        f"{amount(total, 'table')}."
     )
 
 
 def looks_sentence(result: Result) -> str:
     """How many looks were taken, and which z luck alone is expected to reach."""
-    earlier = (
-        f"; {result.earlier:,} earlier looks at its tables are known" if result.earlier else ""
-    )
+    tables = len(next(iter(result.variants[0].agents.values())).evidence)
+    earlier, z = "", "z" if tables == 1 else "pooled z"
+    if result.earlier:
+        known = f"{amount(result.earlier, 'earlier look')} at its {plural('table', tables)}"
+        earlier = f"; {known} {'is' if result.earlier == 1 else 'are'} known"
     sentence = f"This study took {amount(result.looks, 'look')}{earlier}."
     if result.trials > 1:
         sentence += (
             f" The best of {result.trials:,} configurations without skill is expected to reach a "
-            f"pooled z of {decimal(result.threshold)}; a lower z is no evidence."
+            f"{z} of {decimal(result.threshold)}; a lower z is no evidence."
         )
     return sentence
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from qfolio.report import palette
@@ -12,6 +13,9 @@ from qfolio.report.figures.style import dashes, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+NAME = 30
+"""Characters in a line of the legend; a long name would take the room of the chart."""
 
 
 def draw_wealth(data: BacktestData, width: float) -> Figure:
@@ -49,7 +53,7 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
                 axes[0].fill_between(days, low, high, color=color, alpha=0.15, linewidth=0)
         else:
             marker = {}
-        handles += axes[0].plot(days, middle, **style, **marker, label=name)
+        handles += axes[0].plot(days, middle, **style, **marker, label=fill(name, NAME))
         axes[1].plot(days, -median_drawdown(series), **{**style, "linewidth": 0.5 * look.width})
     axes[0].set_yscale("log")
     axes[0].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -187,9 +187,12 @@ def _cut_beginning(axes: Axes, optimum: float) -> None:
 def _draw_regret(axes: Axes, data: ReportData, curves: list[tuple[Curve, str]]) -> None:
     """Draw the regret, as a share of the optimum, on a logarithmic scale."""
     _line_axes(axes, "Regret, on a logarithmic scale", data)
-    regrets = [regret(curve.returns, data.optimum) for curve, _ in curves]
-    for (curve, color), missed in zip(curves, regrets, strict=True):
+    regrets = []
+    for curve, color in curves:
+        missed = regret(curve.returns, data.optimum)
+        assert missed is not None  # or there would be no panel for it
         _draw_runs(axes, curve.done, missed, color, least=LEAST_REGRET)
+        regrets.append(missed)
     least = max(min(interquartile_mean(missed).min() for missed in regrets), LEAST_REGRET)
     worst = max(missed.max() for missed in regrets)
     top = min(max(worst, 10 * least), 10**DECADES * least)

@@ -128,27 +128,30 @@ const tools = (() => {
     return Math.min(Math.ceil(widest) + 12, most);
   }
 
-  /** Puts names where lines end, moved apart where they would overlap. */
+  /** Puts names where lines end, in several lines if need be, moved apart where they would overlap. */
   function label(id, chart, axis, entries) {
     const place = byId(id);
     place.replaceChildren();
     const { _offset: top, _length: height } = chart._fullLayout[axis];
-    const gap = narrow.matches ? 13 : 14;
-    const marks = entries.map((entry) => ({ ...entry, at: top + entry.at * height }))
-      .sort((a, b) => a.at - b.at);
-    for (let i = 1; i < marks.length; i += 1) marks[i].at = Math.max(marks[i].at, marks[i - 1].at + gap);
-    let limit = top + height + gap / 2;
-    for (const mark of marks.toReversed()) {
-      mark.at = Math.min(mark.at, limit);
-      limit = mark.at - gap;
-    }
-    for (const mark of marks) {
+    const marks = entries.map((entry) => {
       const span = document.createElement("span");
-      span.textContent = mark.name;
-      span.style.top = `${mark.at}px`;
+      span.className = "end";
+      span.textContent = entry.name;
       span.style.width = `${chart.layout.margin.r - 8}px`;
-      span.style.color = color(mark.color);
+      span.style.color = color(entry.color);
       place.append(span);
+      return { span, half: span.offsetHeight / 2, at: top + entry.at * height };
+    }).sort((a, b) => a.at - b.at);
+    let limit = -Infinity;
+    for (const mark of marks) {
+      mark.at = Math.max(mark.at, limit + mark.half);
+      limit = mark.at + mark.half;
+    }
+    limit = top + height + (narrow.matches ? 13 : 14); // a line below the axis
+    for (const mark of marks.toReversed()) {
+      mark.at = Math.min(mark.at, limit - mark.half);
+      limit = mark.at - mark.half;
+      mark.span.style.top = `${mark.at}px`;
     }
   }
 

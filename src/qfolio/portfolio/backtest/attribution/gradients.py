@@ -9,7 +9,6 @@ mean over midpoints, and each directional derivative takes one forward pass.
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import msgspec
@@ -17,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from qfolio.core.mdp import Agent
+from qfolio.core.mdp import Agent, task_jit
 from qfolio.portfolio.backtest.attribution.replays import open_to
 from qfolio.portfolio.backtest.attribution.slices import answer
 from qfolio.portfolio.backtest.replay import Stretch
@@ -93,7 +92,7 @@ def integrated_gradients(
     )
 
 
-@eqx.filter_jit(donate="none")
+@task_jit
 def integrated(
     task: Portfolio,
     agent: Agent,

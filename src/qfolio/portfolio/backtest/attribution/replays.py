@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from qfolio.core.mdp import Agent
+from qfolio.core.mdp import Agent, task_jit
 from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.folds import tested
 from qfolio.portfolio.backtest.replay import Stretch
@@ -201,7 +201,7 @@ def _replay(
     return Replays(np.concatenate(targets, 1), np.concatenate(before, 1))
 
 
-@eqx.filter_jit(donate="none")
+@task_jit
 def _paths(
     task: Portfolio, raw: tuple[Array, Array], agent: Agent, members: PyTree, first: Array,
     held: Holding, shuffled: tuple[Array, ...], count: int,

@@ -17,7 +17,6 @@ latest row.
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import msgspec
@@ -25,7 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from qfolio.core.mdp import Agent
+from qfolio.core.mdp import Agent, task_jit
 from qfolio.portfolio.backtest.attribution.replays import Observed, open_to, seen_in_test
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.task import Portfolio
@@ -147,7 +146,7 @@ def answer(
     return mean
 
 
-@eqx.filter_jit(donate="none")
+@task_jit
 def _answers(
     task: Portfolio, agent: Agent, members: PyTree, row: Array, asset: int,
     grids: Array, who: Array, starts: Array, holdings: Array,
