@@ -18,8 +18,8 @@ from made_up import table, written
 from qfolio.core.registry import BASELINES, short
 from qfolio.portfolio.backtest.attribution.factors import factor_returns
 from qfolio.portfolio.backtest.baselines import baseline
+from qfolio.portfolio.backtest.bound import constant_bound
 from qfolio.portfolio.backtest.folds import walk_forward
-from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.costs import with_cash

@@ -5,7 +5,7 @@ import numpy as np
 
 from qfolio.portfolio.study.evidence import TableReturns
 from qfolio.portfolio.study.folder import Look, Result, StudyConfig, TableConfig, Variant
-from qfolio.portfolio.study.result import summarize
+from qfolio.portfolio.study.summary import summarize
 
 from tables import weekdays
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from qfolio.core.text import near, printable
+from qfolio.core.version import __version__
 from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 
 SHELLS = ("bash", "zsh", "fish")
@@ -79,16 +80,14 @@ def run() -> NoReturn:
 
 def _call(words: list[str]) -> None:
     """Runs the command that the words name, or shows the commands."""
+    if words == ["--version"]:
+        print(f"qfolio {__version__}")
+        return
     import tyro
 
     from qfolio.commands.parsing import chosen, summary
     from qfolio.core.errors import QfolioError
 
-    if words == ["--version"]:
-        from qfolio import __version__
-
-        print(f"qfolio {__version__}")
-        return
     known, name = commands(), words[0] if words else ""
     if name in known:
         chosen(known[name], name, words[1:])()

@@ -24,6 +24,13 @@ def test_the_command_says_where_the_board_is_and_ends_with_ctrl_c(tmp_path):
             process.kill()
 
 
+def test_the_board_does_not_wait_for_numpy():
+    served = "from qfolio.report.board import server; server._text('board.html')"
+    code = f"import sys; {served}; print('numpy' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout == "False\n"
+
+
 def test_a_folder_that_is_none_is_refused_in_a_sentence(monkeypatch, capsys, tmp_path):
     assert qfolio(monkeypatch, "board", tmp_path / "none", "--no-open") == 2
     assert "is not a folder; give the one that holds your runs" in capsys.readouterr().err

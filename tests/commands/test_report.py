@@ -12,11 +12,14 @@ from qfolio.experiments.comparison.run import Comparison, Entrant
 from qfolio.experiments.continual import Plan
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.run import Tuning
+from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
+from qfolio.portfolio.study.run import Study
 from qfolio.report import printing
 from qfolio.tasks.pendulum import Pendulum
 
 from shell import TINY, TINY_BACKTEST, qfolio, succeed
-from tables import write_table
+from tables import price_table, random_walk, write_table
+from tiny import PATHWISE
 
 
 @pytest.fixture(scope="module")
@@ -132,9 +135,22 @@ def begin_search(folder):
     )  # fmt: skip
 
 
+class Alike(EqualWeight):
+    """A baseline of this module."""
+
+
+def begin_study(folder):
+    tables = {"one": price_table(random_walk(160, seed=0))}
+    Study.create(
+        tables, {"pathwise": PATHWISE}, train="80d", test="40d", seeds=1,
+        baselines=[f"{__name__}:Alike"], out=folder,
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("begin", "command"),
     [
+        (begin_study, ["study", "--resume"]),
         (begin_comparison, ["compare", "--resume"]),
         (begin_search, ["tune", "--join"]),
         (

@@ -93,7 +93,7 @@ def test_resume_goes_on(run, monkeypatch, capsys):
     assert "Nothing is left to train" in out
     assert "become" not in out
     assert qfolio(monkeypatch, "train", "--resume", folder, "--steps", "481") == 0
-    assert re.search(r"481 steps become 48\d: dqn takes 1 step in each of", capsys.readouterr().out)
+    assert re.search(r"481 steps become 48\d: DQN takes 1 step in each of", capsys.readouterr().out)
 
 
 def test_watch_without_a_display_writes_a_gif(run, monkeypatch, capsys):
@@ -169,6 +169,7 @@ def test_progress_here_is_that_of_groups_of_seeds_where_a_run_has_some(begun):
         (["evaluate", "nowhere"], "nowhere is no run"),
         (["evaluate", "nowhere", "--episodes", "0"], "must be from 1 to"),
         (["watch", "nowhere"], "nowhere is no run"),
+        (["watch", "nowhere", "--episodes", "0"], "must be from 1 to"),
     ],
 )
 def test_wrong_input_gets_one_sentence_and_code_2(
@@ -319,9 +320,12 @@ def test_a_setting_without_a_default_is_in_the_commands_that_repeat_the_training
     words = ["priced_parts:Priced", "--agent", "q-learning", "--steps", 90, "--set", "price=2"]
     assert qfolio(monkeypatch, "train", *words, "--seeds", 1, "--out", "run") == 0
     assert "--set price=2.0\n" in (tmp_path / "run" / "report.html").read_text()
+    assert capsys.readouterr().out.startswith("Q-learning on priced_parts:Priced · preset fast · ")
     assert qfolio(monkeypatch, "tune", *words, "--search", "discount=0.5|0.9", "--trials", 2,
                   "--seeds", 1, "--out", "search") == 0  # fmt: skip
-    assert re.search(r"^qfolio train .* --set .*price=2\.0$", capsys.readouterr().out, re.MULTILINE)
+    printed = capsys.readouterr().out
+    assert printed.startswith("Q-learning on priced_parts:Priced · preset fast · 2 trials × 1 seed")
+    assert re.search(r"^qfolio train .* --set .*price=2\.0$", printed, re.MULTILINE)
     assert qfolio(monkeypatch, "train", *words[:-2], "--out", "x") == 2
     assert "Priced needs price; give price a default" in capsys.readouterr().err
     sys.modules.pop("priced_parts", None)

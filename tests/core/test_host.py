@@ -20,8 +20,9 @@ from qfolio.core.host import Environments, HostPopulation
 from qfolio.core.population import Population
 from qfolio.experiments import presets
 from qfolio.experiments.budget import Budget
-from qfolio.experiments.run import Run
+from qfolio.experiments.run import Run, train
 from qfolio.tasks.gymnasium import GymnasiumTask
+from qfolio.tasks.pendulum import Pendulum
 
 from populations import assert_same, first_member, stored, train_to
 from probes import RewardDelay
@@ -306,6 +307,42 @@ def test_every_graded_episode_is_that_of_its_seed():
         assert_same(population.evaluate(start_keys(few)).returns, many[:, :few])
 
 
+@pytest.mark.parametrize("kind", [Numbered, Aim, Shares])
+def test_a_policy_acts_in_the_environment_as_it_is_graded(kind):
+    """With states and actions that do not begin at 0, with bounds, and with whole numbers."""
+    ppo = PPO(num_envs=2, rollout_length=8, batch_size=16, epochs=1, hidden=(8,))
+    run = train(task(kind), SMALL if kind is Numbered else ppo, steps=200, seeds=2, seed=3)
+    keys = start_keys(5)
+    graded = run.population.evaluate(keys).returns
+    env = gymnasium.make(ENVIRONMENTS[kind])
+    for member, seed in enumerate((3, 4)):
+        policy = run.policy(seed)
+        for start, number in enumerate(np.asarray(jax.random.key_data(keys))[:, -1].tolist()):
+            (seen, _), over, earned = env.reset(seed=number), False, 0.0
+            while not over:
+                seen, reward, terminated, truncated, _ = env.step(policy(seen))
+                over, earned = terminated or truncated, earned + reward
+            assert earned == pytest.approx(graded[member, start], rel=1e-5)
+    with pytest.raises(QfolioError, match="seed is 5; the run has 3 to 4"):
+        run.policy(5)
+    if kind is Aim:
+        with pytest.raises(QfolioError, match=r"shape \(3,\); gym:TestAim-v0 has \(2,\)"):
+            run.policy()(np.zeros(3))
+
+
+def test_a_policy_keeps_what_it_was_made_with():
+    run = train(Pendulum(horizon=20), DQN(hidden=(8,), learning_starts=10), episodes=2)
+    policy, seen = run.policy(), np.array([1.0, 0.0, 0.5])
+    weights = run.first_weights()
+    values = run.agent.action_values(weights, seen[None].astype(np.float32))
+    assert values is not None
+    assert policy(seen) == values.argmax()
+    before = run.population.fetch()
+    zeros = jax.tree.map(np.zeros_like, before)
+    run.population.restore(zeros)
+    assert policy(seen) == values.argmax()
+
+
 def test_it_goes_on_from_a_checkpoint_in_new_episodes(tmp_path):
     numbered = task(Delay)
     run = Run.create(numbered, SMALL, steps=33, seeds=2, out=tmp_path / "run")
@@ -374,7 +411,7 @@ def test_what_was_learned_outlives_an_exception_of_an_environment(monkeypatch):
             r"""FrozenLake-v1 cannot be made with kwargs={"map_name": "9x9"}: KeyError: '9x9' \(""",
         ),
         (lambda: task(Unmade), r"TestUnmade-v0 cannot be made: OSError: no license \(test_host"),
-        (lambda: task(Endless, kwargs="cut=3"), "JSON object"),
+        (lambda: task(Endless, kwargs="cut=3"), "^kwargs is cut=3; it must be a JSON object"),
         (lambda: task(Endless, kwargs={"cut": 3}), "kwargs is {'cut': 3}; it must be JSON"),
         (lambda: task(Delay, horizon=-1), "horizon is -1"),
         (lambda: Population(task(Delay), SMALL, [0]).advance(4), "cannot be compiled"),
@@ -395,7 +432,7 @@ def test_it_says_what_is_wrong(make, message):
         ("longer", r"step 2 .* has the shape \(3,\) and its observation space \(2,\)"),
         ("number", r"step 2 .* has the shape \(\) and its observation space \(2,\)"),
         ("raises", r"step 2 of an episode: KeyError: 'missing' \(test_host.py, line \d+\)"),
-        ("old interface", r"step 2 of an episode: ValueError: not enough values"),
+        ("old interface", r"step 2 of an episode: its step returned 4 values; wanted are obs"),
         ("fails to start", r"the start of an episode: RuntimeError: no license"),
     ],
 )  # fmt: skip

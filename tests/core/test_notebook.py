@@ -2,7 +2,7 @@
 
 import math
 
-from qfolio.core.notebook import ROWS, card, number
+from qfolio.core.notebook import ROWS, card
 
 
 def test_everything_is_escaped():
@@ -24,9 +24,3 @@ def test_long_tables_are_cut():
     text = card("t", [], ["n"], [[str(i)] for i in range(ROWS + 5)])
     assert text.count("<tr>") == 1 + ROWS
     assert "and 5 more" in text
-
-
-def test_numbers_that_are_none():
-    assert [number(x) for x in (None, math.nan, -1234.56, 0.012345)] == [
-        "–", "–", "−1,235", "0.01235",
-    ]  # fmt: skip

@@ -4,7 +4,17 @@ import math
 
 import pytest
 
-from qfolio.core.text import amount, closest, csv_cell, figure, listed, near, printable, quote
+from qfolio.core.text import (
+    amount,
+    closest,
+    csv_cell,
+    figure,
+    four_digits,
+    listed,
+    near,
+    printable,
+    quote,
+)
 
 
 @pytest.mark.parametrize(
@@ -50,6 +60,27 @@ def test_zero_has_no_sign():
         "–",
         "–",
     ]
+    assert [figure(x, "+.1%") for x in (math.inf, -math.inf)] == ["+∞%", "−∞%"]
+    assert figure(math.inf, ",.2f") == "∞"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (999.96, "1,000"),
+        (999.94, "999.9"),
+        (1234.4, "1,234"),
+        (-12345.6, "−12,346"),
+        (1.0, "1.000"),
+        (0.5, "0.5"),
+        (0.012345, "0.01235"),
+        (0.0, "0"),
+        (None, "–"),
+        (math.nan, "–"),
+    ],
+)
+def test_numbers_with_four_digits(value: float | None, text: str):
+    assert four_digits(value) == text
 
 
 def test_counts_and_lists():

@@ -21,7 +21,7 @@ from qfolio.core.statistics import interquartile_mean
 from qfolio.core.text import figure
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
-from qfolio.experiments.comparison.conclusion import conclusion, four_digits, share
+from qfolio.experiments.comparison.conclusion import conclusion, share
 from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.operations import operations_per_step
 from qfolio.experiments.comparison.ranking import (
@@ -205,13 +205,6 @@ def test_agents_that_are_as_quick_are_named_together():
         "To settle within 10% of the optimum, a and b need the fewest steps (1,000) and the least "
         "time ("
     )
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(999.96, "1,000"), (999.94, "999.9"), (1234.4, "1,234"), (0.5, "0.5")]
-)
-def test_returns_have_four_digits(value, text):
-    assert four_digits(value) == text
 
 
 def test_a_critic_is_no_part_of_the_policy():
@@ -612,7 +605,7 @@ def test_the_report():
     # c is told apart from both, a and b are not: of six pairs, four are bold.
     table = text[text.index('class="grid"') : text.index("Computational cost")]
     assert len(re.findall(r"<b>(?:100|0)</b>", table)) == 4
-    assert len(re.findall(r"<td class=\"(?:win|loss)\d\">\d", table)) + 4 >= 5
+    assert len(re.findall(r"<td class=\"(?:gain|loss)\d\">\d", table)) + 4 >= 5
     # Offline, without scripts, and in the colors of the page.
     assert not re.search(r"<script|https?://(?!www\.w3\.org)|url\((?!#)", text)
     assert text.count("<svg viewBox") == 4

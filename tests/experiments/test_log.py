@@ -14,7 +14,8 @@ from qfolio.experiments import log as logs
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.events import EVENTS, read
 from qfolio.experiments.fit import Training, fit
-from qfolio.experiments.log import Log, Tracker, _parts, means, tracked
+from qfolio.experiments.lasting import lasting
+from qfolio.experiments.log import Log, Tracker, _parts, add_result, means, tracked
 from qfolio.experiments.machines.messages import Report
 from qfolio.experiments.machines.remote import hear
 from qfolio.experiments.records import Records
@@ -225,6 +226,40 @@ def test_trackers_hear_means_over_members(tmp_path):
     with Log(tmp_path / "mine").opened(kind="run") as log:
         log.job().record(6, {"loss": [1.0]})  # nobody follows
     assert heard == [("mine", "run"), (5, {"dqn/loss": 2.0}), "finished"]
+
+
+def test_grades_are_a_part_of_work_that_lasts(tmp_path):
+    """They come before the end, and trackers hear of them; an error while grading is told."""
+    heard: list[object] = []
+
+    class Listening(Tracker):
+        def log(self, values, step):
+            heard.append((step, dict(values)))
+
+        def finish(self):
+            heard.append("finished")
+
+    with lasting(), tracked(Listening()):
+        for folder in ("a", "b"):
+            (tmp_path / folder).mkdir()
+            with Log(tmp_path / folder).opened(kind="run") as log:
+                log.job().record(5, {"loss": [1.0]})
+        add_result(tmp_path / "a", {"dqn": {"return": -1.5, "regret": None}})
+        with Log(tmp_path / "a").opened(kind="run") as again:
+            again.settle(True)
+        assert heard == [(5, {"loss": 1.0}), (5, {"loss": 1.0}), (5, {"result/dqn/return": -1.5})]
+    assert heard[3:] == ["finished", "finished"]
+    assert [event["event"] for event in logged(tmp_path / "a")] == [
+        "start", "record", "result", "end",
+    ]  # fmt: skip
+    (tmp_path / "c").mkdir()
+    with pytest.raises(ValueError, match="of grading"), lasting():  # noqa: PT012
+        with Log(tmp_path / "c").opened(kind="run") as log:
+            log.settle(True)
+        raise ValueError("of grading")
+    assert logged(tmp_path / "c")[-1]["state"] == "failed"
+    add_result(tmp_path / "c", {"dqn": {"return": 1.0}})  # of work that has ended
+    assert logged(tmp_path / "c")[-1]["event"] == "result"
 
 
 def test_a_log_without_a_folder_writes_nothing(task, agent, tmp_path, monkeypatch):

@@ -24,7 +24,7 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.desk.desk import Desk
-from qfolio.portfolio.desk.rule import Rule
+from qfolio.portfolio.desk.untrained import Rule
 from qfolio.portfolio.following import on_table
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.feasible import exactly
@@ -690,6 +690,7 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
     for source in (
         rows,
         numbered.set_axis([7, 9]),  # numbers that are no dates
+        numbered[["A", "B", "C", "Z", "date"]],
         rows.astype(bool),
         *(tmp_path / name for name in ("rows.csv", "numbered.csv", "truth.csv", "spans.csv")),
     ):

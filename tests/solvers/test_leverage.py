@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from optima import lognormal_scenarios, merton
 from qfolio.core.errors import QfolioError
-from qfolio.solvers.merton import leveraged_optimal, lognormal_scenarios, merton
+from qfolio.solvers.merton import leveraged_optimal
 
 TWO = np.array([[0.04, 0.01], [0.01, 0.09]])
 
@@ -132,7 +133,6 @@ def test_one_asset_alone() -> None:
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: merton([0.1], [[0.04]], rate=0.02, borrowing=0.01),
         lambda: leveraged_optimal([[1.0], [0.0]]),
         lambda: leveraged_optimal([[1.1], [0.9]], [0.5, 0.4]),
         lambda: leveraged_optimal([[1.1], [0.9]], risk_aversion=0.0),

@@ -6,12 +6,13 @@ import math
 import numpy as np
 import pytest
 
+from optima import lognormal_scenarios, merton, no_trade_growth, regime
 from qfolio.core.errors import QfolioError
 from qfolio.solvers.ar1 import Ar1Optimum, ar1
 from qfolio.solvers.kelly import kelly
-from qfolio.solvers.merton import growth_optimal, lognormal_scenarios, merton
-from qfolio.solvers.no_trade import no_trade_growth, no_trade_region, no_trade_region_discrete
-from qfolio.solvers.regime import regime, regime_bands
+from qfolio.solvers.merton import growth_optimal
+from qfolio.solvers.no_trade import no_trade_region, no_trade_region_discrete
+from qfolio.solvers.regime import regime_bands
 
 # ------------------------------------------------------------------------ Kelly, growth, Merton
 
@@ -215,12 +216,6 @@ def test_ar1_converges_on_finer_grids(signal_market: Ar1Optimum) -> None:
     assert at_zero[0] == pytest.approx(at_zero[1], abs=3e-6)
 
 
-def test_ar1_weights_that_stay_put_matter_little(signal_market: Ar1Optimum) -> None:
-    fixed = ar1(drifting=False)
-    assert fixed.growth == pytest.approx(signal_market.growth, abs=1e-5)
-    assert fixed.holdings == pytest.approx(fixed.levels)
-
-
 def test_ar1_policy_in_simulation(signal_market: Ar1Optimum) -> None:
     rng = np.random.default_rng(0)
     paths, steps = 4000, 400
@@ -398,14 +393,6 @@ def test_discrete_no_trade_region_without_costs_is_growth_optimal() -> None:
         lambda: growth_optimal([[1.0, 2.0]], [0.5]),
         lambda: growth_optimal([[1.0, 2.0]], [0.5, 0.5]),
         lambda: growth_optimal([[1.0, 2.0], [0.0, 0.0]]),
-        lambda: merton([0.1], [[0.0]]),
-        lambda: merton([0.1, 0.2], [[0.04]]),
-        lambda: merton([0.1], [[0.04]], risk_aversion=0.0),
-        lambda: lognormal_scenarios(np.zeros(9), np.eye(9), 0.1),
-        lambda: lognormal_scenarios([0.1], [[0.04]], 0.0),
-        lambda: regime((0.9, 1.0), (0.1, 0.1), 0.0),
-        lambda: regime((0.9, 0.9), (0.1, math.inf), 0.0),
-        lambda: regime((0.9, 0.9), (0.1, 0.1), -1.0),
         lambda: ar1(rho=1.0),
         lambda: ar1(noise=math.inf),
         lambda: ar1(slope=1.0),
@@ -416,7 +403,6 @@ def test_discrete_no_trade_region_without_costs_is_growth_optimal() -> None:
         lambda: no_trade_region(-0.01, 0.2, 0.01),
         lambda: no_trade_region(0.02, 0.0, 0.01),
         lambda: no_trade_region(0.02, 0.2, 1.0),
-        lambda: no_trade_growth(0.5, 0.5, 0.02, 0.2, 0.01),
         lambda: no_trade_region_discrete(0.02, 0.2, 0.01, 0.0),
         lambda: no_trade_region_discrete(0.02, 0.2, 1.0, 0.25),
     ],

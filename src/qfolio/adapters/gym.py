@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from qfolio.core import settings, simplex
-from qfolio.core.errors import QfolioError, require_type
+from qfolio.core.errors import QfolioError, needs, require_type
 from qfolio.core.evaluation import step_key
 from qfolio.core.market import View
 from qfolio.core.mdp import Discrete, Simplex
@@ -29,11 +29,11 @@ from qfolio.portfolio.prices.table import load
 from qfolio.portfolio.rewards import Outcome
 from qfolio.portfolio.task import Portfolio
 
-try:
+with needs(
+    "gymnasium", otherwise="qfolio.adapters.gym needs Gymnasium: pip install 'qfolio[gym]'."
+):
     import gymnasium
     from gymnasium import spaces
-except ImportError:
-    raise QfolioError("qfolio.adapters.gym needs Gymnasium: pip install 'qfolio[gym]'.") from None
 
 ID = "qfolio/Portfolio-v0"
 

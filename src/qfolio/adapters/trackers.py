@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from qfolio.core import registry
-from qfolio.core.errors import QfolioError, one_line
+from qfolio.core.errors import QfolioError, needs, one_line
 from qfolio.experiments.log import Tracker
 
 PROJECT = "qfolio"
@@ -89,9 +89,5 @@ def _made(name: str) -> Tracker:
 
 
 def _module(name: str, package: str) -> ModuleType:
-    try:
+    with needs(name, otherwise=f"This tracker needs {name}: pip install '{package}'."):
         return import_module(name)
-    except ImportError:
-        raise QfolioError(
-            f"This tracker needs {name}, which is not installed: pip install '{package}'."
-        ) from None

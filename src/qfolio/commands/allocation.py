@@ -115,7 +115,7 @@ def allocate(
     name = next(iter(desk.run.agents)) if agent is None else agent
     standing = Standing.of(folder, name, desk.kind(name))
     if not anyway:
-        standing.require_sound(folder, named=agent is not None)
+        standing.require_sound(desk.resume, named=agent is not None)
     followed = desk.followed(name)
     table = desk.table(followed, prices)
     if table.levels and (holdings or whole_shares or orders):

@@ -13,7 +13,6 @@ from tyro.conf import UseAppendAction, arg
 
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
-from qfolio.core.registry import own_modules
 from qfolio.experiments.budget import Budget
 
 if TYPE_CHECKING:
@@ -83,10 +82,14 @@ def typed() -> str:
     return shlex.join(["qfolio", *sys.argv[1:]])
 
 
-def typed_options() -> set[str]:
-    """The options that were typed, by the names of their parameters."""
-    names = (word.partition("=")[0] for word in sys.argv[1:] if word.startswith("--"))
-    return {name[2:].replace("-", "_") for name in names}
+def continues(*more: str) -> bool:
+    """Whether only options were typed that keep the settings of what is resumed.
+
+    more: names of the command's own options that do.
+    """
+    words = (word.partition("=")[0] for word in sys.argv[1:] if word.startswith("--"))
+    names = {word[2:].removeprefix("no-").replace("-", "_") for word in words}
+    return names <= {"resume", "join", "on", "track", "trust", "json", *more}
 
 
 def training_command(
@@ -100,13 +103,3 @@ def training_command(
     words += [f"--{config.budget.unit}", str(config.budget.amount), *more]
     words += ["--set"] if changed else []
     return shlex.join([*words, *(f"{k}={settings.written(v)}" for k, v in changed.items())])
-
-
-def again(command: str, folder: Path, *parts: object, on: str = "here") -> str:
-    """The command line that resumes the work in a folder.
-
-    parts: the tasks and agents; modules of a user's own must be trusted again. on: where it ran.
-    """
-    modules = own_modules(*parts)
-    words = [*command.split(), str(folder), *(["--trust", *modules] if modules else [])]
-    return shlex.join([*words, *(["--on", on] if on != "here" else [])])

@@ -18,10 +18,10 @@ from qfolio.commands.arguments import (
     Name,
     Sources,
     Trackers,
+    continues,
     new_folder,
     sources,
     typed,
-    typed_options,
 )
 from qfolio.commands.tables import READING, Reading
 from qfolio.core import registry, settings
@@ -117,8 +117,7 @@ class Options(Reading):
 
         table: Whether those for reading a table may be typed, too.
         """
-        own = {"resume", "on", "track", "trust", "json"}
-        return typed_options() <= (own | READING.reading.keys() if table else own)
+        return continues(*(READING.reading if table else ()))
 
     def folder(self, kind: str) -> Path:
         """The path of the new folder: ``out``, or runs/KIND-TIME."""

@@ -11,8 +11,8 @@ from qfolio.commands.arguments import (
     Modules,
     Name,
     Trackers,
-    again,
     budget_of,
+    continues,
     new_folder,
     prepare,
     typed,
@@ -20,7 +20,8 @@ from qfolio.commands.arguments import (
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import amount, figure
+from qfolio.core.registry import again
+from qfolio.core.text import amount, figure, four_digits
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -66,8 +67,7 @@ def compare(
             module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
     """
-    given = (task, agents, preset, episodes, steps, seeds, seed, out)
-    if resume is not None and any(option is not None for option in given):
+    if resume is not None and (task is not None or not continues()):
         raise QfolioError(
             "--resume keeps the comparison's settings; add only --on, --track and --trust."
         )
@@ -202,7 +202,7 @@ def _print_ranking(content: dict[str, Any]) -> None:
     from qfolio.experiments.comparison.ranking import HEADLINE
 
     ranking = content["ranking"]
-    write = conclusion.share if ranking["measure"] == "regret" else conclusion.four_digits
+    write = conclusion.share if ranking["measure"] == "regret" else four_digits
     near = f"steps to {HEADLINE:.0%}"
     spread = "95% interval" if ranking["seeds"] >= FEWEST_SEEDS else "range of seeds"
     heads = ("agent", ranking["measure"], spread, "worst", near, "s a seed", "parameters")

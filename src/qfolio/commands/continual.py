@@ -12,7 +12,7 @@ from qfolio.commands.arguments import (
     Modules,
     Name,
     Trackers,
-    again,
+    continues,
     new_folder,
     prepare,
     typed,
@@ -20,6 +20,7 @@ from qfolio.commands.arguments import (
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
+from qfolio.core.registry import again
 from qfolio.core.text import figure
 
 if TYPE_CHECKING:
@@ -71,10 +72,7 @@ def continual(
             module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
     """
-    given = (task, agent, preset, episodes, seeds, seed, rate, renewal, epsilon, out)
-    if resume is not None and (
-        change or assignments or any(option is not None for option in given)
-    ):
+    if resume is not None and (task is not None or not continues()):
         raise QfolioError("--resume keeps the experiment's settings; add only --track and --trust.")
     prepare(trust)
     from qfolio.adapters.trackers import trackers

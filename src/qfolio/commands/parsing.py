@@ -21,6 +21,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg, configure
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import finite, near
+from qfolio.experiments.lasting import lasting
 
 PAGE = "report.html"
 
@@ -107,7 +108,8 @@ def grouped(command: Callable[..., Any]) -> Callable[..., None]:
         for name, kind in kinds.items():
             own = [field.name for field in dataclasses.fields(kind)]
             given[name] = kind(**{option: given.pop(option) for option in own})
-        _report(command, given, as_json)
+        with lasting():
+            _report(command, given, as_json)
 
     call: Any = configure(OmitArgPrefixes)(lambda **given: run(given))
     call.__name__, call.__doc__ = command.__name__, command.__doc__

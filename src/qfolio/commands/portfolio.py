@@ -4,11 +4,12 @@ import dataclasses
 
 from tyro.conf import Positional
 
-from qfolio.commands.arguments import File, Name, again, prepare
+from qfolio.commands.arguments import File, Name, prepare
 from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points
 from qfolio.commands.parsing import PAGE, Document, Failed, outcome
 from qfolio.commands.tables import READING, Read
 from qfolio.core.errors import QfolioError
+from qfolio.core.registry import again
 
 
 def prices(file: Positional[File] = None, *, reading: Read = READING) -> Document:

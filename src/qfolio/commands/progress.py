@@ -6,7 +6,8 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import TYPE_CHECKING, NoReturn
 
-from qfolio.commands.console import console, number, say
+from qfolio.commands.console import console, say
+from qfolio.core.text import four_digits
 from qfolio.core.training import episode_steps
 from qfolio.experiments.fit import Listener, Training
 from qfolio.experiments.interrupts import EXIT_CODE
@@ -46,7 +47,7 @@ class RunProgress(Listener):
     def on_chunk(self, training: Training, rows: Records) -> None:
         run, budget = self.run, training.budget
         done = run.done(budget.unit)
-        value = number(float(rows.column("return").mean()) if rows else math.nan)
+        value = four_digits(float(rows.column("return").mean()) if rows else math.nan)
         rate = f"{training.steps_per_second:,.0f}"
         epsilon = rows[-1].get("epsilon", math.nan) if rows else math.nan
         explored = "–" if math.isnan(epsilon) else f"{epsilon:.2f}"
@@ -58,8 +59,8 @@ class RunProgress(Listener):
         if len(run.evaluations) > self.points:
             now = run.evaluations[self.points :][-len(run.population.seeds) :]
             self.points = len(run.evaluations)
-            greedy = number(sum(row["return"] for row in now) / len(now))
-            cells = (f"{done:,}", value, greedy, number(self.optimum), explored, rate, left)
+            greedy = four_digits(sum(row["return"] for row in now) / len(now))
+            cells = (f"{done:,}", value, greedy, four_digits(self.optimum), explored, rate, left)
             say("".join(f"{cell:>11}" for cell in cells))
             if self.show is not None:
                 self.show(run)
@@ -134,7 +135,7 @@ def print_batch(now: "Progress | None" = None) -> None:
     """Prints a line for a batch of a search, or the heads of the columns before the first."""
     cells: tuple[str, ...] = ("trials", "diverged", "best", "preset", "an hour")
     if now is not None:
-        best, preset = (number(trial and trial.value) for trial in (now.best, now.preset))
+        best, preset = (four_digits(trial and trial.value) for trial in (now.best, now.preset))
         rate = f"{3600 * now.trials / now.seconds:,.0f}"
         cells = (f"{now.done}/{now.total}", str(now.diverged), best, preset, rate)
     say("".join(f"{cell:>11}" for cell in cells))

@@ -7,10 +7,11 @@ from unicodedata import normalize
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import again, prepare
+from qfolio.commands.arguments import prepare
 from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core.errors import QfolioError
+from qfolio.core.registry import again
 
 if TYPE_CHECKING:
     from qfolio.portfolio.backtest.run import Backtest
@@ -50,7 +51,7 @@ def study(
     prepare(options.trust)
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
-    from qfolio.commands.console.study import describe_study, print_study, spell
+    from qfolio.commands.console.study import describe_study, print_study
     from qfolio.commands.progress import JobsProgress, stop
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
@@ -80,13 +81,12 @@ def study(
             "--resume keeps the study's settings; add only --on, --track and --trust."
         )
     console.say(*describe_study(run))
-    parts = run.backtest(next(iter(run.config.tables))).parts
-    resume = again("qfolio study --resume", run.folder, *parts, on=options.on)
+    resume = again("qfolio study --resume", run.folder, *run.parts, on=options.on)
     with resumable(resume), console.bar("") as update, tracked(*following):
 
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1
-            console.say(f"{place} of {len(run.places)}: {table}, {spell(variant)}")
+            console.say(f"{place} of {len(run.places)}: {table}, {variant.text}")
             for note in shortened(backtest.config.agents, backtest.replay):
                 console.tell(note)
             return JobsProgress(update)

@@ -14,8 +14,8 @@ from qfolio.commands.arguments import (
     Modules,
     Name,
     Trackers,
-    again,
     budget_of,
+    continues,
     new_folder,
     prepare,
     training_command,
@@ -23,6 +23,7 @@ from qfolio.commands.arguments import (
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError, require_whole
+from qfolio.core.registry import again
 from qfolio.core.text import amount, listed
 from qfolio.experiments.budget import MOST_STARTS
 from qfolio.experiments.events import CONTRAST
@@ -113,7 +114,7 @@ def train(
             folder = out or new_folder(task, registry.short(agent), preset)
             chosen = settings.parse(assignments)
             run = _new_run(task, agent, preset, budget, seeds, seed or 0, folder, chosen)
-        elif assignments or any(x is not None for x in (task, agent, preset, seeds, seed, out)):
+        elif task is not None or not continues("episodes", "steps", "compare", "live"):
             raise QfolioError(
                 "--resume keeps the run's settings; add only --episodes or --steps, --on, --track, "
                 "--trust, --no-compare or --live."
@@ -197,8 +198,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
     from qfolio.commands.console import say
     from qfolio.commands.window import Window, has_display
 
-    if episodes < 1:
-        raise QfolioError(f"--episodes is {episodes}; it must be at least 1.")
+    require_whole("--episodes", episodes, 1, MOST_STARTS)
     prepare(trust)
     from qfolio.core.evaluation import STARTS
     from qfolio.core.files import write_bytes
@@ -284,13 +284,14 @@ def _contrast(run: "Run", folder: Path, executor: "Executor") -> "Run | None":
     """The training of the report's variant, with one setting changed; resumable, too."""
     from qfolio.commands.console import say
     from qfolio.experiments.run import Run
+    from qfolio.experiments.run_folder import CHECKPOINT
     from qfolio.report.contrast import contrast_of
 
     variant = contrast_of(run.agent)
     if variant is None:
         return None
     place = folder / CONTRAST
-    if (place / "checkpoint.safetensors").exists():
+    if (place / CHECKPOINT).exists():
         contrast = Run.open(place)
     else:
         config = run.config
@@ -316,11 +317,12 @@ def write_again(folder: Path) -> None:
     """Writes the report of a finished run, from the grades in its summary."""
     from qfolio.core.files import read_json
     from qfolio.experiments.run import Run
+    from qfolio.experiments.run_folder import CHECKPOINT
     from qfolio.report.collect import report_data
     from qfolio.report.training import write_report
 
     run, place = Run.open(folder), folder / CONTRAST
-    contrast = Run.open(place) if (place / "checkpoint.safetensors").exists() else None
+    contrast = Run.open(place) if (place / CHECKPOINT).exists() else None
     if contrast is not None and run.budget.left(contrast.population):
         contrast = None  # it was left out
     path = folder / "summary.json"

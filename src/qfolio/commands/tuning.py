@@ -12,15 +12,16 @@ from qfolio.commands.arguments import (
     Modules,
     Name,
     Trackers,
-    again,
     budget_of,
+    continues,
     new_folder,
     prepare,
     training_command,
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, needs
+from qfolio.core.registry import again
 from qfolio.core.text import amount
 
 if TYPE_CHECKING:
@@ -93,14 +94,13 @@ def tune(
     from qfolio.experiments.machines.choice import on as executor_of
 
     executor, following = executor_of(on), trackers(track)
-    given: list[Any] = [task, agent, preset, seeds, episodes, steps, out]
     budget = budget_of(episodes, steps)
     if join is None:
         task = task or "pendulum"
         agent = agent or presets.default_agent(task)
         work = _new(task, agent, preset or "fast", trials, seeds, budget, batch, search,
                     assignments, out)  # fmt: skip
-    elif search or assignments or any(x is not None for x in given):
+    elif task is not None or not continues("trials", "batch"):
         raise QfolioError(
             "--join keeps the settings of the search; add only --trials, --batch, --on, --track or "
             "--trust."
@@ -145,14 +145,9 @@ def write_again(folder: Path) -> None:
 
 
 def _tuning() -> Any:
-    try:
+    missing = "qfolio tune needs Optuna to choose configurations: pip install 'qfolio[tune]'."
+    with needs("optuna", otherwise=missing):
         import qfolio.experiments.tuning.run
-    except ModuleNotFoundError as error:
-        if error.name != "optuna":
-            raise
-        raise QfolioError(
-            "qfolio tune needs Optuna to choose configurations: pip install 'qfolio[tune]'."
-        ) from None
     return qfolio.experiments.tuning.run
 
 

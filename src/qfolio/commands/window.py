@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, needs
 
 
 def has_display() -> bool:
@@ -26,13 +26,10 @@ class Window:
 
     def __init__(self, caption: str = "qfolio") -> None:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-        try:
+        missing = "The window needs Gymnasium and pygame: pip install 'qfolio[watch]'."
+        with needs("gymnasium", "pygame", otherwise=missing):
             import gymnasium
             import pygame
-        except ImportError:
-            raise QfolioError(
-                "The window needs Gymnasium and pygame: pip install 'qfolio[watch]'."
-            ) from None
         self._pygame: Any = pygame
         self._env: Any = gymnasium.make("Pendulum-v1", render_mode="human")
         self._open = True

@@ -1,10 +1,11 @@
 """The exception for errors that a user can fix, and checks that raise it."""
 
+import contextlib
 import inspect
 import reprlib
 import sysconfig
 import traceback
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from numbers import Integral
 from pathlib import Path, PurePath
 from types import UnionType
@@ -86,6 +87,20 @@ def require_methods(kind: type, *bases: type) -> None:
                 raise QfolioError(
                     f"{kind.__name__}.{name} must be a method that takes {listed(wanted)}."
                 ) from None
+
+
+@contextlib.contextmanager
+def needs(*packages: str, otherwise: str) -> Iterator[None]:
+    """Raises QfolioError if an import within it lacks one of some optional packages.
+
+    otherwise: what it says. A package that is there, but cannot be imported, raises its own error.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name not in packages:
+            raise
+        raise QfolioError(otherwise) from None
 
 
 def _is(value: object, kinds: type | UnionType | tuple[type, ...]) -> bool:

@@ -130,7 +130,13 @@ class Environments:
         self._steps += 1
         for i in range(count) if which is None else which:
             try:
-                observation, reward[i], terminated[i], truncated[i], _ = self._steppers[i](given[i])
+                result = self._steppers[i](given[i])
+                if len(result) != 5:
+                    raise QfolioError(
+                        f"its step returned {len(result)} values; wanted are observation, reward, "
+                        "terminated, truncated and info"
+                    )
+                observation, reward[i], terminated[i], truncated[i], _ = result
                 after[i] = self._seen(observation)
             except Exception as error:
                 raise self._failure(i, error) from error
@@ -232,6 +238,24 @@ class HostPopulation(Population):
 
     def task_fault(self, member: int = 0) -> None:
         """None: what an environment returns is checked at each step."""
+
+    def policy(self, member: int = 0) -> Callable[[Any], Any]:
+        """Takes an observation, and returns the action, in the environment's own format."""
+        inner, facts, (shape, kind) = super().policy(member), self.task.facts, self.task.observation
+
+        def policy(observation: Any) -> Any:
+            seen: np.ndarray = np.asarray(facts.seen(observation), kind)
+            if seen.shape != shape:
+                raise QfolioError(
+                    f"The observation has the shape {seen.shape}; {name_of(self.task)} has {shape}."
+                )
+            return facts.given(inner(seen)[None])[0]
+
+        return policy
+
+    def _member(self, member: int) -> tuple[Task, Agent]:
+        found: tuple[Task, Agent] = self._join(self._own[member], self._shared)
+        return found
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
         """Greedy returns (member, start) from environments seeded by the keys.

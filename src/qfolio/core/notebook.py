@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from html import escape
 
-from qfolio.core.text import figure, printable
+from qfolio.core.text import printable
 
 ROWS = 20
 """Most rows of a table; a line says how many more there are."""
@@ -31,11 +31,6 @@ def card(
     if len(rows) > ROWS:
         parts.append(f"<small>and {len(rows) - ROWS} more</small>")
     return "".join(parts)
-
-
-def number(value: float | None) -> str:
-    """Four significant digits, with a true minus sign; a dash if there is no number."""
-    return "–" if value is None or not math.isfinite(value) else figure(value, ",.4g")
 
 
 def _text(text: str) -> str:

@@ -107,6 +107,11 @@ class Population:
         """Whether the losses and weights of each member have been finite so far."""
         return self._fetch(lambda state: state.healthy).tolist()
 
+    @property
+    def env_steps(self) -> int:
+        """Steps of each member so far, over all its environments."""
+        return self.steps * self.agent.num_envs
+
     def steps_left(self, episodes: int | None = None, *, steps: int | None = None) -> int:
         """Steps of each environment until every member has used its budget; 0 if all have.
 
@@ -171,9 +176,26 @@ class Population:
 
     def task_fault(self, member: int = 0) -> str | None:
         """What is wrong with a member's task, if the fault is not in the learning."""
-        own = jax.tree.map(lambda leaf: jnp.asarray(leaf[member]), self._members.fetch(self._own))
-        task, agent = self._join(own, self._shared)
+        task, agent = self._member(member)
         return faults.find(task, agent, self.seeds[member])
+
+    def policy(self, member: int = 0) -> Callable[[PyTree], PyTree]:
+        """A member's greedy policy as it is now: a function of one observation to its action."""
+        weights = jax.tree.map(lambda x: x[member], self.weights())
+        _, agent = self._member(member)
+        act = jax.jit(lambda weights, seen: agent.policy(weights, seen))
+
+        def policy(observation: PyTree) -> PyTree:
+            seen = jax.tree.map(lambda x: np.asarray(x)[None], observation)
+            return jax.tree.map(lambda x: np.asarray(x)[0], act(weights, seen))
+
+        return policy
+
+    def _member(self, member: int) -> tuple[Task, Agent]:
+        """A member's task and agent."""
+        own = jax.tree.map(lambda leaf: jnp.asarray(leaf[member]), self._members.fetch(self._own))
+        found: tuple[Task, Agent] = self._join(own, self._shared)
+        return found
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
         """Greedy returns (member, start) and overestimation (member,) of the current policies.

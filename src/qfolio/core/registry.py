@@ -10,12 +10,14 @@ from someone else: they must be in modules that have already been imported (``im
 
 import dataclasses
 import os
+import shlex
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from itertools import chain
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
@@ -245,6 +247,16 @@ def own_modules(*instances: object) -> list[str]:
     names = [name_of(instance).removeprefix(GYM) for instance in instances]
     modules = [name.rpartition(":")[0] for name in names]
     return sorted({name for name in modules if name and not name.startswith("qfolio.")})
+
+
+def again(command: str, folder: Path, *parts: object, on: str = "here") -> str:
+    """The command line that resumes the work in a folder.
+
+    parts: the tasks and agents; modules of a user's own must be trusted again. on: where it ran.
+    """
+    modules = own_modules(*parts)
+    words = [*command.split(), str(folder), *(["--trust", *modules] if modules else [])]
+    return shlex.join([*words, *(["--on", on] if on != "here" else [])])
 
 
 def trust(modules: Iterable[str]) -> None:

@@ -50,14 +50,22 @@ def plural(noun: str, count: int) -> str:
 def figure(value: float | None, form: str) -> str:
     """A number in one of Python's formats, such as ``+.1%``, as the terminal shows it.
 
-    Negative numbers have a true minus sign; zero has no sign. A dash stands for NaN and None.
+    Negative numbers have a true minus sign; zero has no sign. ∞ stands for infinity, and a dash for
+    NaN and None.
     """
     if value is None or value != value:
         return "–"
     text = f"{value:{form}}"
     if not text.strip("+-0.,%"):
         text = text.lstrip("+-")
-    return text.replace("-", "\N{MINUS SIGN}")
+    return text.replace("-", "\N{MINUS SIGN}").replace("inf", "∞")
+
+
+def four_digits(value: float | None) -> str:
+    """A number with four significant digits, and all those before its decimal point."""
+    if value is not None and abs(float(f"{value:.4g}")) >= 1000:
+        return figure(value, ",.0f")
+    return figure(value, ".4g" if value is None or abs(value) < 1 else "#.4g")
 
 
 def listed(names: Sequence[str], word: str = "and") -> str:

@@ -272,7 +272,7 @@ def _compare(
     ) -> tuple[Course | None, bool]:
         worlds = grades if name == FIRST else grades[::-1]
         listeners = [] if listen is None else [listen(name)]
-        job = log.job(name, seed_names(seeds), population.steps * population.agent.num_envs)
+        job = log.job(name, seed_names(seeds), population.env_steps)
         return _learn(population, episodes, points, worlds, job, listeners)
 
     grades = Grades(plan.task), Grades(plan.changed)
@@ -384,8 +384,7 @@ class _Curve(Listener):
     def add(self, population: Population, steps: int) -> None:
         self.steps.append(steps * population.agent.num_envs)
         self.regrets.append(self.world.regrets(population, population.curve_starts))
-        done = population.steps * population.agent.num_envs
-        self.job.record(done, {"greedy regret": self.regrets[-1]})
+        self.job.record(population.env_steps, {"greedy regret": self.regrets[-1]})
 
     def on_chunk(self, training: Training, rows: Records) -> None:
         self.add(training.population, training.done)
@@ -417,7 +416,7 @@ def _learn(
         if stopped and not training.finished:
             return None, True
     else:
-        job.log.write("done", job=job.name, step=population.steps * population.agent.num_envs)
+        job.log.write("done", job=job.name, step=population.env_steps)
     final, other = (world.regrets(population, population.starts) for world in (here, there))
     why = unlearned(population.agent, curve.steps[-1]) if anew else ""
     return Course(curve.steps, curve.regrets, final, other, seconds, why), stopped

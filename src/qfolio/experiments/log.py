@@ -20,6 +20,7 @@ from qfolio.core.errors import QfolioError, one_line, told
 from qfolio.core.files import naming
 from qfolio.experiments.events import BEAT, EVENTS
 from qfolio.experiments.fit import Listener, Training
+from qfolio.experiments.lasting import kept
 from qfolio.experiments.records import Records
 
 SHARE, SHORTEST, LONGEST = 0.05, 0.05, 1.0
@@ -45,14 +46,12 @@ class Tracker:
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Called with numbers by name; with several jobs, the names are ``job/metric``.
 
+        Grades are ``result/agent/measure``. They come after the training, where a command trains.
         step: environment steps of each of the job's members.
         """
 
     def event(self, event: Mapping[str, Any]) -> None:
-        """Called with every event after the start, as logged; records also go to ``log``.
-
-        What is graded after the training, as a run's ``result``, is only in the log and the report.
-        """
+        """Called with every event after the start, as logged; numbers also go to ``log``."""
 
     def finish(self) -> None:
         """Called when the work has ended, for whatever reason."""
@@ -81,11 +80,26 @@ class Log:
         self.folder, self._file = folder, -1
         self._trackers: list[Tracker] = []
         self._telling = threading.Lock()
+        self._step = 0  # the last that trackers were told
         self.state = "done"  # how the work ends, unless an error ends it
 
     @contextlib.contextmanager
     def opened(self, **about: Any) -> Iterator["Log"]:
-        """Logs the start, and the end for whatever reason; about: a description of the work."""
+        """Logs the start, and the end for whatever reason; about: a description of the work.
+
+        Within ``lasting`` it ends with that block, and goes on if it is opened there again.
+        """
+        outer = kept()
+        if outer is None or self.folder is None:
+            with self._opened(about) as log:
+                yield log
+            return
+        if self.folder not in outer.logs:
+            outer.logs[self.folder] = outer.enter_context(self._opened(about))
+        yield outer.logs[self.folder]
+
+    @contextlib.contextmanager
+    def _opened(self, about: Mapping[str, Any]) -> Iterator["Log"]:
         trackers = _trackers.get()
         with contextlib.ExitStack() as stack:
             if self.folder is not None:
@@ -133,6 +147,17 @@ class Log:
         """
         return JobLog(self, name, members, since)
 
+    def result(self, values: Mapping[str, Mapping[str, float | None]]) -> None:
+        """Logs the measures of trained agents, by name."""
+        self.write("result", values=values)
+        known = {
+            f"result/{name}/{measure}": x
+            for name, measures in values.items()
+            for measure, x in measures.items()
+            if x is not None and math.isfinite(x)
+        }
+        self._tell(lambda tracker: tracker.log(known, self._step))
+
     def track(self, job: str, step: int, values: Mapping[str, Sequence[float | None]]) -> None:
         """Passes the means over members to the trackers."""
         if self._trackers:
@@ -142,6 +167,7 @@ class Log:
                 for name, each in values.items()
             }
             means = {f"{prefix}{k}": sum(x) / len(x) for k, x in known.items() if x}
+            self._step = step
             self._tell(lambda tracker: tracker.log(means, step))
 
     def _tell(self, tell: Callable[[Tracker], None]) -> None:
@@ -274,13 +300,16 @@ def seed_names(seeds: Iterable[int]) -> list[str]:
 def add_result(folder: Path | None, values: Mapping[str, Mapping[str, float | None]]) -> None:
     """Appends the measures of trained agents, by name, to a folder's log if it has one.
 
-    Trackers have finished by then.
+    Trackers hear of them within ``lasting``; else they have finished by then.
     """
-    if folder is not None and (folder / EVENTS).exists():
+    outer = kept()
+    if outer is not None and folder in outer.logs:
+        outer.logs[folder].result(values)
+    elif folder is not None and (folder / EVENTS).exists():
         log = Log(folder)
         log._file = _open(folder / EVENTS)
         try:
-            log.write("result", values=values)
+            log.result(values)
         finally:
             log._close()
 

@@ -1,7 +1,7 @@
 """A run: the training of one agent's seeds on one task, and its records."""
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,12 @@ import jax
 import numpy as np
 
 from qfolio.core import devices, faults
-from qfolio.core.errors import require_type
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.files import locked, new_folder, path_of, require_new
 from qfolio.core.mdp import Agent, Task
-from qfolio.core.notebook import card, number
+from qfolio.core.notebook import card
 from qfolio.core.registry import short
-from qfolio.core.text import amount
+from qfolio.core.text import amount, four_digits
 from qfolio.experiments.budget import Budget, require_budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
@@ -135,7 +135,10 @@ class Run(Seeds):
                 *([] if self.folder is None else [str(self.folder)]),
             ],
             ("seed", "greedy return"),
-            [(str(int(row["seed"])), number(row["return"])) for row in self.evaluations[-seeds:]],
+            [
+                (str(int(row["seed"])), four_digits(row["return"]))
+                for row in self.evaluations[-seeds:]
+            ],
             np.reshape(points, (-1, seeds)).mean(1).tolist(),
         )
 
@@ -186,6 +189,18 @@ class Run(Seeds):
     def first_weights(self) -> Any:
         """The first seed's learned weights."""
         return jax.tree.map(lambda x: x[0], self.population.weights())
+
+    def policy(self, seed: int | None = None) -> Callable[[Any], Any]:
+        """The greedy policy of a seed as it is now: a function of one observation to an action.
+
+        Both are in the format of an environment of Gymnasium; with other tasks they are those of
+        ``task.observe`` and ``task.step``.
+        seed: one of the run's seeds (default: the first); QfolioError for others.
+        """
+        seeds = self.population.seeds
+        if seed is not None and seed not in seeds:
+            raise QfolioError(f"seed is {seed}; the run has {seeds[0]} to {seeds[-1]}.")
+        return self.population.policy(0 if seed is None else seeds.index(seed))
 
     def grade(self, starts: int | None = None) -> dict[str, Any]:
         """Grades each seed's greedy policy on the first fixed start states.

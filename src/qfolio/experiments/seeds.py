@@ -83,7 +83,7 @@ class Seeds:
     def done(self, unit: str) -> int:
         """Episodes or environment steps of each seed so far."""
         if unit == "steps":
-            return self.population.steps * self.agent.num_envs
+            return self.population.env_steps
         return self.episodes
 
     def train_here(

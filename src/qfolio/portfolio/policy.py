@@ -27,12 +27,12 @@ from qfolio.experiments.fit import Listener, fit
 from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio import policy_folder, signals
 from qfolio.portfolio.costs import CostModel, cashed
+from qfolio.portfolio.few_rows import fitted
 from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.mandate.limits import mandate_text
 from qfolio.portfolio.prices.findings import day, listing
 from qfolio.portfolio.prices.frequency import require_alike
 from qfolio.portfolio.prices.table import Prices, load
-from qfolio.portfolio.short import fitted
 from qfolio.portfolio.task import Portfolio
 
 UPDATE_RATE = 0.1
@@ -64,7 +64,7 @@ def train(
             ``seed + 1``, ….
         episodes: Training episodes of each agent (default: the preset's).
         task: Settings of the portfolio task (cost, lag, window, …) that replace the preset's. A
-            preset's horizon is shortened if the table has too few rows for it, see ``short.py``.
+            preset's horizon becomes a half or a third if the table has too few rows for all of it.
 
     Raises:
         QfolioError: Table, settings and agent do not fit together, or a loss is not finite.

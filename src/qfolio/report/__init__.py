@@ -1,1 +1,1 @@
-"""Reports: self-contained pages and their figures, tables in the terminal, and the live board."""
+"""Reports: self-contained pages and their figures, and the live board."""

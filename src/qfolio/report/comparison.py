@@ -16,11 +16,10 @@ import numpy as np
 from qfolio.core.arrays import AnyFloats
 from qfolio.core.files import write_text
 from qfolio.core.statistics import FEWEST_SEEDS, band, interquartile_mean
-from qfolio.core.text import plural
+from qfolio.core.text import four_digits, plural
 from qfolio.experiments.comparison.conclusion import (
     arrived,
     best_of,
-    four_digits,
     least,
     share,
     span,
@@ -400,11 +399,10 @@ def _better(data: ComparisonData) -> list[tuple[str, list[dict[str, Any] | None]
 
 
 def _cell(probability: float, ends: list[float], told_apart: bool) -> dict[str, Any]:
-    shade = min(5, math.ceil(10 * abs(probability - 0.5) - 1e-9))
     return {
         "value": number(100 * probability, 0),
         "interval": " … ".join(number(100 * end, 0) for end in ends) if ends[0] < ends[1] else "",
-        "shade": f"{'win' if probability > 0.5 else 'loss'}{shade}" if shade else "",
+        "shade": rendering.shade(2 * probability - 1),
         "apart": told_apart,
     }
 

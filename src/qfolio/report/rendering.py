@@ -2,14 +2,12 @@
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from importlib import resources
 from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
-from qfolio.core.arrays import Floats
-from qfolio.core.statistics import FEWEST_SEEDS
 from qfolio.core.text import figure, plural
 from qfolio.report import palette
 
@@ -42,8 +40,6 @@ def render(template: str, **context: Any) -> str:
 
 def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
     """Return a number with a typographic minus sign and commas between thousands."""
-    if math.isinf(value):
-        return "\N{MINUS SIGN}∞" if value < 0 else "+∞" if sign else "∞"
     return figure(value, f"{'+' if sign else ''},.{digits}f")
 
 
@@ -59,8 +55,14 @@ def percent(fraction: float, digits: int = 1, *, sign: bool = False) -> str:
     return f"{number(100 * fraction, digits, sign=sign)}%"
 
 
+def shade(share: float) -> str:
+    """The class of a table's cell, in five shades of more (up to 1) or less (down to −1)."""
+    level = min(math.ceil(5 * abs(share) - 1e-9), 5)
+    return f"{'gain' if share > 0 else 'loss'}{level}" if level else ""
+
+
 def over_seeds(
-    values: Sequence[float] | Floats,
+    values: Collection[float],
     interval: Sequence[float] | None,
     write: Callable[[float], str],
 ) -> str:
@@ -74,6 +76,8 @@ def over_seeds(
 
 def bands(seeds: int) -> str:
     """Return a description of the bands of learning curves; see ``core.statistics.band``."""
+    from qfolio.core.statistics import FEWEST_SEEDS  # loads numpy, which the board does without
+
     if seeds < FEWEST_SEEDS:
         return "from the worst to the best seed"
     return "95% bootstrap intervals over seeds"

@@ -14,10 +14,10 @@ from qfolio.core.files import write_text
 from qfolio.core.text import amount, listed, plural
 from qfolio.portfolio.backtest.statistics.verdict import p_text
 from qfolio.portfolio.study.evidence import Active, Evidence
-from qfolio.portfolio.study.folder import Result, StudyConfig, StudyFolder, Variant
+from qfolio.portfolio.study.folder import Result, StudyConfig, StudyFolder
 from qfolio.portfolio.study.pooling import Pools
 from qfolio.portfolio.study.run import Study
-from qfolio.portfolio.study.verdict import decimal, looks_sentence, percent
+from qfolio.portfolio.study.verdict import decimal, growth_text, looks_sentence
 from qfolio.report import rendering
 from qfolio.report.axis import Axis, ticks_around
 from qfolio.report.rendering import THIN_SPACE, counted, number, render, setting_groups
@@ -96,9 +96,8 @@ def render_study(
     return render(
         "study.html",
         data=config,
-        result=result,
         title=f"{agents} on {on}",
-        spelled=_spelled(main.variant),
+        spelled=main.variant.text,
         facts=_facts(config, result),
         looks=looks_sentence(result),
         notes=[(listed(names), note) for note, names in notes.items()],
@@ -181,10 +180,10 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
             "bar": bar(pooled.growth, pooled.low, pooled.high),
             "side": _side(pooled.low, pooled.high),
             "cells": [
-                (percent(pooled.growth), _interval(pooled.low, pooled.high)),
+                (growth_text(pooled.growth), _interval(pooled.low, pooled.high)),
                 ("",),
                 (f"z {decimal(pooled.z)}", _chance(pooled.p_holm)),
-                (percent(rest.growth), f"z {decimal(rest.z)}", _chance(rest.p_holm)),
+                (growth_text(rest.growth), f"z {decimal(rest.z)}", _chance(rest.p_holm)),
                 (decimal(pools.sharpe.difference), f"z {decimal(pools.sharpe.z)}"),
             ],
             "label": _label(pooled.growth, pooled.low, pooled.high),
@@ -199,10 +198,10 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
 def _cells(known: Evidence) -> list[tuple[str, ...]]:
     active, rest = known.to_reference, known.to_rebalanced
     return [
-        (percent(active.growth), _interval(active.low, active.high)),
+        (growth_text(active.growth), _interval(active.low, active.high)),
         (decimal(active.information_ratio), f"TE {_spread(active)}"),
         (decimal(active.t),),
-        (percent(rest.growth), f"t {decimal(rest.t)}"),
+        (growth_text(rest.growth), f"t {decimal(rest.t)}"),
         (decimal(known.sharpe), f"t {decimal(known.sharpe_t)}", known.baseline),
     ]
 
@@ -226,18 +225,13 @@ def _variants(result: Result, agent: str) -> dict[str, Any] | None:
 def _cell(pools: Pools, main: bool) -> dict[str, Any]:
     pooled = pools.to_reference
     return {
-        "growth": percent(pooled.growth),
+        "growth": growth_text(pooled.growth),
         "interval": _interval(pooled.low, pooled.high),
         "z": decimal(pooled.z),
         "rest": decimal(pools.to_rebalanced.z),
-        "shade": _shade(pooled.z),
+        "shade": rendering.shade(round(pooled.z or 0.0) / 5),
         "main": main,
     }
-
-
-def _shade(z: float | None) -> str:
-    level = 0 if z is None else min(5, round(abs(z)))
-    return f"{'win' if z and z > 0 else 'loss'}{level}" if level else ""
 
 
 def _side(low: float | None, high: float | None) -> str:
@@ -247,11 +241,13 @@ def _side(low: float | None, high: float | None) -> str:
 
 
 def _interval(low: float | None, high: float | None) -> str:
-    return "no interval" if low is None or high is None else f"{percent(low)} … {percent(high)}"
+    if low is None or high is None:
+        return "no interval"
+    return f"{growth_text(low)} … {growth_text(high)}"
 
 
 def _label(growth: float | None, low: float | None, high: float | None) -> str:
-    return f"{percent(growth)}, 95% interval {_interval(low, high)}"
+    return f"{growth_text(growth)}, 95% interval {_interval(low, high)}"
 
 
 def _chance(p: float | None) -> str:
@@ -261,10 +257,6 @@ def _chance(p: float | None) -> str:
 def _spread(active: Active) -> str:
     spread = active.tracking_error
     return "undefined" if spread is None else rendering.percent(spread)
-
-
-def _spelled(variant: Variant) -> str:
-    return f"lag {variant.lag}, {variant.bps:g}{THIN_SPACE}bp"
 
 
 def _or(value: float | None) -> float:

@@ -85,7 +85,7 @@ def _facts(data: Sweep) -> list[tuple[str, str, str]]:
         ),
         ("Best found", number(best.value, digits), f"trial {best.number + 1}, on tuning starts"),
         ("Best, graded", "diverged" if math.isnan(graded) else number(graded, digits), note),
-        ("Trials an hour", number(hour, 0), f"{config['batch']} at once, one process"),
+        ("Trials an hour", number(hour, 0), f"{config['batch']} at once"),
     ]
 
 

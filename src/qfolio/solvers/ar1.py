@@ -57,7 +57,6 @@ def ar1(
     cost: float = 0.002,
     levels: ArrayLike = LEVELS,
     discount: float = 0.97,
-    drifting: bool = True,
     signal_points: int | None = None,
     holding_parts: int = 4,
 ) -> Ar1Optimum:
@@ -66,8 +65,8 @@ def ar1(
     At each step the agent sees the signal x and the weight it holds and names a level b. It pays
     the remainder factor from weight to level, then earns log(1 + b r), where
     r = drift + slope·x + volatility·η is a simple return with the mean of the signal *seen*; then
-    x' = rho·x + noise·ε. With ``drifting`` the weight moves with the price, to
-    b(1 + r)/(1 + b r), and is brought back at a cost; without, it stays at its level.
+    x' = rho·x + noise·ε. The weight moves with the price, to b(1 + r)/(1 + b r), and is brought
+    back at a cost.
 
     Value iteration on (signal, weight): the expectation over x' is a sum over equally spaced
     signals within five standard deviations (exact to rounding for smooth functions), and that over
@@ -80,7 +79,6 @@ def ar1(
         cost: Proportional and one way, at least 0 and below 1.
         levels: Ascending weights in [0, 1] to choose from.
         discount: Discount per step, from 0 to 0.9999.
-        drifting: Whether prices move the weights.
         signal_points: Size of the signal's grid, at least 11 (default: 201, or as many more as keep
             its points within a shock of each other).
         holding_parts: Cells of the grid of held weights between two levels.
@@ -115,8 +113,8 @@ def ar1(
     reward = np.log(grown) @ chances
     ends = np.union1d([0.0, 1.0], b)
     places = np.arange((len(ends) - 1) * holding_parts + 1) / holding_parts
-    holdings = np.interp(places, np.arange(len(ends)), ends) if drifting else b
-    later = b[:, None] * ((1 + returns) / grown if drifting else np.ones_like(grown))
+    holdings = np.interp(places, np.arange(len(ends)), ends)
+    later = b[:, None] * (1 + returns) / grown
     cell = np.clip(np.searchsorted(holdings, later, side="right") - 1, 0, len(holdings) - 2)
     share = np.clip((later - holdings[cell]) / (holdings[cell + 1] - holdings[cell]), 0, 1)
     row = np.arange(len(x))[:, None, None]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from qfolio.solvers.shared import gauss, require, step_length
+from qfolio.solvers.shared import require, step_length
 
 
 class GrowthOptimum(NamedTuple):
@@ -20,9 +20,11 @@ class GrowthOptimum(NamedTuple):
     """Worst violation of the optimality conditions; growth is optimal to within this number."""
 
 
-def growth_optimal(
-    relatives: ArrayLike, probabilities: ArrayLike | None = None, tol: float = 1e-9
-) -> GrowthOptimum:
+TOLERANCE = 1e-9
+"""Largest violation of the conditions that ``growth_optimal`` accepts."""
+
+
+def growth_optimal(relatives: ArrayLike, probabilities: ArrayLike | None = None) -> GrowthOptimum:
     """The weights b on the simplex that maximize E log(b·x) over finitely many scenarios.
 
     On the rows of a price history this is the best constant-rebalanced portfolio. Since
@@ -35,11 +37,10 @@ def growth_optimal(
     Args:
         relatives: Shape (scenario, asset), at least 0; cash, if wanted, is a column of ones.
         probabilities: Shape (scenario,), summing to 1 (default: equal).
-        tol: Largest violation of the conditions that is accepted.
 
     Raises:
         QfolioError: The arguments are not valid scenarios, every asset is worthless in one of them,
-            or the tolerance is not reached.
+            or the conditions are not met.
     """
     x = np.asarray(relatives, dtype=float)
     require(
@@ -54,13 +55,13 @@ def growth_optimal(
     b = np.full(y.shape[1], 1 / y.shape[1])
     for _ in range(10):
         b = b * _marginal(y, p, b)
-    b = _newton_on_support(y, p, *_interior_point(y, p, b), tol)
+    b = _newton_on_support(y, p, *_interior_point(y, p, b))
     slope = _marginal(y, p, b) - 1
     violation = float(np.max(np.where(b > 0, np.abs(slope), slope)))
     require(
-        violation <= tol,
-        f"the growth-optimal weights violate the optimality conditions by {violation:.1g}, more "
-        f"than tol={tol:.1g}; give a larger tolerance",
+        violation <= TOLERANCE,
+        f"no growth-optimal weights were found; the best ones violate the optimality conditions by "
+        f"{violation:.1g}, more than {TOLERANCE:.1g}",
     )
     return GrowthOptimum(b, float(p @ np.log(x @ b)), max(violation, 0.0))
 
@@ -117,7 +118,6 @@ def _newton_on_support(
     p: Float[np.ndarray, " s"],
     b: Float[np.ndarray, " n"],
     z: Float[np.ndarray, " n"],
-    tol: float,
 ) -> Float[np.ndarray, " n"]:
     """Sets assets not held to exactly 0 and solves the conditions on the rest as equalities."""
     held = b > z
@@ -125,49 +125,15 @@ def _newton_on_support(
     for _ in range(50):
         b /= b.sum()
         slope = _marginal(x, p, b) - 1
-        if np.max(np.where(held, np.abs(slope), slope)) <= tol / 1000:
+        if np.max(np.where(held, np.abs(slope), slope)) <= TOLERANCE / 1000:
             break
-        wanted = held | (slope > tol)
+        wanted = held | (slope > TOLERANCE)
         # Redundant assets leave the step undetermined; the shortest one will do.
         curvature = _curvature(x[:, wanted], p, b[wanted])
         step = np.linalg.lstsq(curvature, slope[wanted], rcond=1e-13)[0]
         b[wanted] = np.maximum(b[wanted] + step, 0.0)
         held = b > 0
     return b
-
-
-def merton(
-    drift: ArrayLike,
-    covariance: ArrayLike,
-    risk_aversion: float = 1.0,
-    rate: float = 0.0,
-    borrowing: float | None = None,
-) -> Float[np.ndarray, " asset"]:
-    """Weights Σ⁻¹(μ − r)/γ of the assets; the rest is cash. Not restricted to the simplex.
-
-    Source: R. C. Merton, "Lifetime Portfolio Selection under Uncertainty" (1969). Prices follow
-    dS/S = μ dt + dB with covariance Σ, utility has constant relative risk aversion γ (1 is log).
-    If borrowing costs more than lending earns, r is the rate at which the assets' weights sum to 1
-    (neither lends nor borrows), but at least the rate of lending and at most that of borrowing.
-
-    Args:
-        drift: Shape (asset,), a year.
-        covariance: Shape (asset, asset), a year, positive definite.
-        risk_aversion: γ > 0.
-        rate: Interest rate that cash earns, a year.
-        borrowing: Interest rate that debt costs, a year, at least ``rate`` (default: ``rate``).
-
-    Raises:
-        QfolioError: γ is not positive, debt costs less than cash earns, or the shapes or the
-            covariance are invalid.
-    """
-    mean, sigma = drift_and_covariance(drift, covariance)
-    borrowing = rate if borrowing is None else borrowing
-    require(0 < risk_aversion < math.inf, f"risk aversion must be positive; not {risk_aversion}")
-    _require_rates(rate, borrowing)
-    each, total = np.linalg.solve(sigma, mean), np.linalg.solve(sigma, np.ones_like(mean))
-    even = (each.sum() - risk_aversion) / total.sum()
-    return np.asarray((each - min(max(even, rate), borrowing) * total) / risk_aversion)
 
 
 class LeveragedOptimum(NamedTuple):
@@ -285,53 +251,6 @@ def _require_rates(cash: float, debt: float) -> None:
         f"debt must cost at least what cash earns, else borrowing to lend pays; not {debt} and "
         f"{cash}",
     )
-
-
-def lognormal_scenarios(
-    drift: ArrayLike, covariance: ArrayLike, dt: float, points: int = 12
-) -> tuple[Float[np.ndarray, "scenario column"], Float[np.ndarray, " scenario"]]:
-    """Merton's market over one step of ``dt`` years as scenarios for ``growth_optimal``.
-
-    They are Gauss–Hermite nodes of log relatives with mean (μ − diag(Σ)/2) dt and covariance Σ dt;
-    there are points**assets of them. With dt → 0 their optimum tends to ``merton``'s weights where
-    those lie within the simplex.
-
-    Args:
-        drift: μ over cash, shape (asset,), a year.
-        covariance: Σ, shape (asset, asset), a year, positive definite.
-        dt: Years in a step.
-        points: Nodes per asset.
-
-    Returns:
-        Relatives of shape (scenario, 1 + asset) with cash first, and probabilities.
-
-    Raises:
-        QfolioError: The shapes or the covariance are invalid, or there are too many scenarios.
-    """
-    mean, sigma = drift_and_covariance(drift, covariance)
-    require(0 < dt < math.inf, f"dt must be positive; not {dt}")
-    assets = len(mean)
-    require(points**assets <= 1_000_000, f"{points}**{assets} scenarios are too many")
-    nodes, weights = gauss(points)
-    z = np.stack(np.meshgrid(*[nodes] * assets, indexing="ij"), -1).reshape(-1, assets)
-    chances = np.stack(np.meshgrid(*[weights] * assets, indexing="ij"), -1).reshape(-1, assets)
-    logs = (mean - np.diag(sigma) / 2) * dt + math.sqrt(dt) * z @ np.linalg.cholesky(sigma).T
-    return np.column_stack([np.ones(len(z)), np.exp(logs)]), chances.prod(1)
-
-
-def drift_and_covariance(drift: ArrayLike, covariance: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Both as arrays of shapes (asset,) and (asset, asset); raises QfolioError if invalid."""
-    mean, sigma = np.asarray(drift, dtype=float), np.asarray(covariance, dtype=float)
-    require(
-        mean.ndim == 1 and mean.size > 0 and sigma.shape == (mean.size, mean.size),
-        f"covariance must be (asset, asset) for drift (asset,); not {sigma.shape}, {mean.shape}",
-    )
-    require(
-        bool(np.all(np.isfinite(mean)) and np.all(np.isfinite(sigma)))
-        and bool(np.allclose(sigma, sigma.T) and np.all(np.linalg.eigvalsh(sigma) > 0)),
-        "covariance must be symmetric and positive definite, else risk-free profit has no optimum",
-    )
-    return mean, sigma
 
 
 def _chances(probabilities: ArrayLike | None, count: int) -> Float[np.ndarray, " s"]:

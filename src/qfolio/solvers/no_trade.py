@@ -5,8 +5,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from qfolio.solvers.shared import log_remainder, require
 
@@ -82,35 +80,6 @@ def no_trade_region(
         float(expit(logit(weight + delta) - math.log1p(-cost))),
         rate + (drift**2 / volatility**2 - volatility**2 * delta**2) / 2,
     )
-
-
-def no_trade_growth(
-    low: ArrayLike,
-    high: ArrayLike,
-    drift: float,
-    volatility: float,
-    cost: float,
-    rate: float = 0.0,
-    buying: float | None = None,
-) -> Float[np.ndarray, "..."]:
-    """Log growth a year of keeping the weight in any region low < high, as in ``no_trade_region``.
-
-    Evaluates a learned region without simulation. ``low`` and ``high`` lie in (0, 1) and broadcast
-    to the shape of the result; the other arguments are those of ``no_trade_region``.
-
-    Raises:
-        QfolioError: An edge is out of range.
-    """
-    from scipy.special import exprel, logit
-
-    buying = cost if buying is None else buying
-    a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-    require(bool(np.all((a > 0) & (a < b) & (b < 1))), "a region needs 0 < low < high < 1")
-    alpha, beta = a * (1 + buying) / (1 + buying * a), b * (1 - cost) / (1 - cost * b)
-    m = 2 * drift / volatility**2 - 1
-    reach = logit(b) - logit(a)
-    inside = m * beta + (beta - alpha) / (reach * exprel(m * reach))
-    return np.asarray(rate + volatility**2 / 2 * inside)
 
 
 def no_trade_region_discrete(

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from qfolio.core.errors import QfolioError, one_line, require_type
+from qfolio.core.errors import QfolioError, needs, one_line, require_type
 from qfolio.core.fields import require, static
 from qfolio.core.host import HostTask
 from qfolio.core.mdp import Box, Discrete, Step
@@ -179,11 +179,11 @@ def _refuse(id: str, what: str, space: Any, wanted: str, wrapper: str) -> NoRetu
 
 
 def _make(id: str, kwargs: str, **options: Any) -> Any:
-    error = _gymnasium().error
+    error, arguments = _gymnasium().error, _arguments(kwargs)
     spec = copy.deepcopy(_spec(id))
     spec.order_enforce, spec.disable_env_checker = False, True  # they cost a third of a step
     try:
-        return _gymnasium().make(spec, max_episode_steps=-1, **_arguments(kwargs), **options)
+        return _gymnasium().make(spec, max_episode_steps=-1, **arguments, **options)
     except (error.DependencyNotInstalled, ImportError) as reason:
         box2d = "pip install 'qfolio[box2d]'." if "ox2" in str(reason) else _sentence(reason)
         raise QfolioError(f"{id} needs more than Gymnasium: {box2d}") from None
@@ -229,8 +229,6 @@ def _sentence(reason: Exception) -> str:
 
 
 def _gymnasium() -> Any:
-    try:
+    with needs("gymnasium", otherwise="gym: needs Gymnasium: pip install 'qfolio[gym]'."):
         import gymnasium
-    except ImportError:
-        raise QfolioError("gym: needs Gymnasium: pip install 'qfolio[gym]'.") from None
     return gymnasium

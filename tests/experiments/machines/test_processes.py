@@ -35,6 +35,7 @@ def begun(*files):
         ("processes", "a number of processes"), ("processes:two", "a number of processes"),
         ("processes:-1", "a number of processes"), ("processes:9999", "from 1 to 1024"),
         ("", "it must be here"), ("ray:", "it must be here"), ("here:1", "it must be here"),
+        ("ray://x", "it must be here"), ("ray://x:abc", "it must be here"),
     ],
 )  # fmt: skip
 def test_texts_that_name_no_executor(text, message):

@@ -7,8 +7,8 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.own_tables import read_own
-from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.writing import write_tables
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 

@@ -20,10 +20,10 @@ from qfolio.portfolio.backtest import notes
 from qfolio.portfolio.backtest.folder import MOST_WEIGHTS, BacktestFolder, rows_written
 from qfolio.portfolio.backtest.kept import LATEST
 from qfolio.portfolio.backtest.replay import Entry, Stretch, decide
-from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.backtest.training import FoldsJob
+from qfolio.portfolio.backtest.writing import write_tables
 from qfolio.portfolio.following import begin, follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices, load
 

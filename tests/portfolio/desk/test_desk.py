@@ -9,7 +9,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk, lookback, waiting
-from qfolio.portfolio.desk.rule import Rule
+from qfolio.portfolio.desk.untrained import Rule
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio

@@ -5,6 +5,8 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.desk.standing import Standing
 
+RESUME = "qfolio backtest --resume run --trust mine"
+
 
 def summary(folder, growth, finding):
     difference = {"growth": {"finding": finding}}
@@ -31,9 +33,15 @@ def test_a_policy_that_is_worse_or_loses_everything_is_not_followed_unasked(
     summary(tmp_path, growth, finding)
     standing = Standing.of(tmp_path, "tilts")
     assert standing.worse is worse
-    standing.require_sound(tmp_path, named=True)
+    standing.require_sound(RESUME, named=True)
     if worse:
         with pytest.raises(QfolioError, match="tilts did something; to trade it nevertheless"):
-            standing.require_sound(tmp_path, named=False)
+            standing.require_sound(RESUME, named=False)
     else:
-        standing.require_sound(tmp_path, named=False)
+        standing.require_sound(RESUME, named=False)
+
+
+def test_a_backtest_that_is_not_finished_is_not_followed_unasked(tmp_path):
+    standing = Standing.of(tmp_path, "tilts")
+    with pytest.raises(QfolioError, match=f"finish it with {RESUME}, or allocate with --anyway"):
+        standing.require_sound(RESUME, named=True)

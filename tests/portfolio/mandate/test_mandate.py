@@ -178,6 +178,8 @@ GROUP = {"assets": ["XLE", "XOM"]}
          r"the floors of assets \(6%\) and sector E of at most 10% clash"),
         ({"groups": {"a": {"E": {**GROUP, "cap": 0.1}}, "b": {"F": {**GROUP, "floor": 0.2}}}},
          "a E of at most 10% and b F of at least 20% clash"),
+        ({"groups": {"a": {"E": {**GROUP, "cap": 0.1}}, "b": {"F is it": {**GROUP, "floor": 0.2}}}},
+         "a E of at most 10% and b F is it of at least 20% clash"),
         ({"groups": {"a": {"E": {**GROUP, "cap": -0.5}}}, "assets": {"floor": -0.1}},
          r"the floors of assets \(-10%\) and a E of at most -50% clash"),
         ({"groups": {"a": {"E": {**GROUP, "cap": -0.5}}}}, "no weights have a E of at most -50%."),

@@ -444,7 +444,7 @@ def test_an_asset_that_is_dropped_does_not_say_where_the_table_starts(late):
     assert len(prices) == len(A) - 2
 
 
-@pytest.mark.parametrize("name", ["cash", "Cash", "CASH"])
+@pytest.mark.parametrize("name", ["cash", "Cash", "CASH", "<CASH>"])
 def test_no_asset_may_be_called_cash(name: str):
     """Weights and holdings have money under this name."""
     table = frame(A=A, **{name: B})

@@ -25,6 +25,14 @@ def test_a_number_holds_from_its_date_until_the_next(tmp_path):
     assert loaded.assets == ("A", "B")
 
 
+def test_the_dates_may_come_last(tmp_path):
+    rate = tmp_path / "bills.csv"
+    for text in ("rate,date\n0.01,2020-01-01\n", "other,bills,date\n7,0.01,2020-01-01\n"):
+        rate.write_text(text)
+        loaded = load(table(tmp_path / "prices.csv"), columns=[f"bills={rate}"])
+        assert (loaded.market == 0.01).all()
+
+
 def test_later_numbers_change_no_earlier_row(tmp_path):
     prices, rate = table(tmp_path / "prices.csv"), tmp_path / "bills.csv"
     found = []

@@ -10,8 +10,8 @@ from qfolio.core.statistics import holm
 from qfolio.experiments.executor import Here
 from qfolio.portfolio.backtest.folds import require_fold
 from qfolio.portfolio.study.folder import Variant
-from qfolio.portfolio.study.result import corrected, summarize
 from qfolio.portfolio.study.run import Study
+from qfolio.portfolio.study.summary import corrected, summarize
 
 from listeners import Interrupt
 from studies import made_up, study

@@ -233,6 +233,24 @@ def test_hostile_lines_do_no_harm(tmp_path, line):
     assert [point[:2] for point in experiment.jobs[""].curves["return"].points] == [(1, 2)]
 
 
+@pytest.mark.parametrize("content", ["", "no log\n" * 9, '{"event": "start", "time": "now"}\n'])
+def test_nothing_is_made_up_of_a_log_that_says_nothing(tmp_path, content):
+    """It was shown as stopped in 1970."""
+    (tmp_path / EVENTS).write_text(content)
+    summary = read_again(tmp_path).summary("key")
+    assert [summary[key] for key in ("begun", "last", "share")] == [None, None, None]
+
+
+@pytest.mark.parametrize(("said", "shown"), [(-3, 0), (7, 1), (1e300, 1), (0.25, 0.25)])
+def test_a_share_lies_between_nothing_and_all(tmp_path, said, shown):
+    write(tmp_path, start(), {**RUNNING, "share": said})
+    experiment = read_again(tmp_path)
+    assert experiment.summary("key")["share"] == shown
+    write(tmp_path, {**RUNNING, "share": 0.5}, {**record(1, 1.0), "share": said})
+    experiment.refresh(2)
+    assert experiment.summary("key")["share"] == shown
+
+
 def test_a_name_that_is_no_text_does_not_hide_the_others(tmp_path):
     write(tmp_path / "good", start(), RUNNING)
     write(Path(os.fsdecode(os.fsencode(tmp_path) + b"/bad\xff")), start(), RUNNING)
@@ -259,6 +277,29 @@ def test_hundreds_of_runs_that_write(tmp_path, monkeypatch):
     assert len(news["keys"]) == 300
     assert time.process_time() - begun < 1  # a hundredth of it, of this process alone
     assert shelf.runs(news["version"])["runs"] == []
+
+
+def test_runs_are_found_however_deep_they_lie(tmp_path):
+    write(tmp_path.joinpath(*"abcdefgh"), start())
+    write(tmp_path / "a" / "near", start())
+    news = Shelf(tmp_path).runs(0)
+    assert {run["name"] for run in news["runs"]} == {"a/near", "a/b/c/d/e/f/g/h"}
+    assert news["searched"] is None
+
+
+def test_of_too_many_folders_the_nearest_are_searched(tmp_path, monkeypatch):
+    for i in range(5):
+        write(tmp_path / f"near-{i}", start())
+        write(tmp_path / "others" / f"far-{i}", start())
+    monkeypatch.setattr(shelves, "FOLDERS", 8)  # the root, the six in it, and one more
+    news = Shelf(tmp_path).runs(0)
+    names = [run["name"] for run in news["runs"]]
+    assert sum(name.startswith("near") for name in names) == 5
+    assert len(names) == 6
+    assert news["searched"] == 8
+    monkeypatch.setattr(shelves, "FOLDERS", 12)
+    news = Shelf(tmp_path).runs(0)
+    assert (len(news["runs"]), news["searched"]) == (10, None)
 
 
 def test_only_jobs_that_changed_are_told_again(tmp_path, monkeypatch):
@@ -370,6 +411,26 @@ def test_reports_have_no_origin(board):
     assert policy.startswith("sandbox allow-scripts;")
     assert "allow-same-origin" not in policy
     assert "connect-src" not in policy  # so that default-src forbids it
+
+
+def test_only_a_report_that_is_served_is_offered(board, monkeypatch):
+    monkeypatch.setattr(shelves, "FRESH", -1.0)
+    report = board.shelf.root / "mine" / "report.html"
+    place, since = f"/reports/{key_of(board)}/report.html", 0
+
+    def offered():
+        nonlocal since
+        news = json.loads(ask(board, f"/runs?since={since}")[1])
+        since = news["version"]
+        return [run["report"] for run in news["runs"]]
+
+    assert (offered(), ask(board, place)[0].status) == ([True], 200)
+    report.unlink()
+    report.symlink_to(board.shelf.root.parent / "report.html")
+    assert (offered(), ask(board, place)[0].status) == ([False], 404)
+    report.unlink()
+    report.write_text("again")
+    assert (offered(), ask(board, place)[0].status) == ([True], 200)
 
 
 def test_parts_have_reports_too(board):

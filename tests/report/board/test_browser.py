@@ -1,5 +1,6 @@
 """The board in a real browser: it moves, hostile names stay text, other pages see nothing."""
 
+import itertools
 import json
 import os
 import shutil
@@ -10,10 +11,12 @@ import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from qfolio.experiments.events import EVENTS, read
+from qfolio.report.board import shelf
 from qfolio.report.board.server import Board
 
 from browser import Browser
@@ -184,12 +187,15 @@ def test_jobs_that_work_was_divided_into_before_leave_the_page(
 
     begin = {"event": "start", "kind": "comparison", "agents": ["dqn"], "pid": 1, "host": "h"}
     write(begin, trained("dqn/0"), trained("dqn/1"))
-    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 2")
+    said = "[...document.querySelectorAll('.cell')].map((cell) => cell.title.split(' ')[0]).join()"
+    browser.show(board.url, 1280, f"{said} === 'dqn/0,dqn/1'")
     write(begin, trained("dqn"), {"event": "done", "job": "dqn"})
-    browser.wait("document.querySelectorAll('#charts .line').length === 3")
+    browser.wait(f"{said} === 'dqn/0,dqn/1,dqn'")
     write({"event": "end", "state": "done", "pid": 1, "host": "h"})
-    browser.wait("document.querySelectorAll('#charts .line').length === 1")
-    assert "dqn/0" not in browser.evaluate("document.body.innerText")
+    browser.wait("document.getElementById('jobs').hidden")
+    jobs = "[...details.values()].flatMap((detail) => [...detail.jobs.keys()])"
+    assert browser.evaluate(jobs) == ["dqn"]
+    assert browser.evaluate("document.querySelectorAll('#charts .line').length") == 1
 
 
 def test_a_metric_may_be_named_like_what_each_object_has(
@@ -242,15 +248,28 @@ def test_agents_of_a_backtest_have_charts_of_their_own(
 
 def test_an_axis_far_from_zero_names_its_ticks_in_full(board: Board, browser: Browser) -> None:
     browser.show(board.url, 1280)
-    axes = [[-1478, -1469], [101.2, 101.9], [-0.35, 0.2], [0, 2e6], [1.2345e6, 1.2352e6], [0, 3e12]]
-    said = browser.evaluate(f"{axes}.map((axis) => ticks(axis, 4).map(short).join(' '))")
+    axes = [[-1478, -1469], [101.2, 101.9], [-0.35, 0.2], [1.2345e6, 1.2352e6], [0, 3e12]]
+    said = browser.evaluate(f"{axes}.map((axis) => labels(ticks(axis, 4)).join(' '))")
     assert said == [
         "−1477.5 −1475 −1472.5 −1470",
         "101.2 101.4 101.6 101.8",
         "−0.2 0 0.2",
-        "0 500k 1M 1.5M 2M",
         "1.2346M 1.2348M 1.235M 1.2352M",
         "0 1e+12 2e+12 3e+12",
+    ]
+
+
+def test_the_ticks_of_an_axis_have_one_unit(board: Board, browser: Browser) -> None:
+    browser.show(board.url, 1280)
+    axes = [[0, 2e6], [0, 10_240], [0, 9000], [0, 2.1e-5], [-4e-4, 0], [0, 0]]
+    said = browser.evaluate(f"{axes}.map((axis) => labels(ticks(axis, 4)).join(' '))")
+    assert said == [
+        "0 0.5M 1M 1.5M 2M",
+        "0 5k 10k",
+        "0 2500 5000 7500",
+        "0 1e−5 2e−5",
+        "−0.0004 −0.0003 −0.0002 −0.0001 0",
+        "0",
     ]
 
 
@@ -260,6 +279,209 @@ def test_a_time_of_almost_two_hours_is_two_hours(board: Board, browser: Browser)
     said = browser.evaluate(f"{times}.map(span).map((text) => text.replaceAll(THIN, ' '))")
     hours = ["1 h 30 min", "1 h 59 min", "2 h 0 min", "47 h 59 min"]
     assert said == ["89 s", "2 min", "89 min", *hours, "2 days"]
+
+
+def finished(folder: Path, kind: str, agents: list[str], *events: dict[str, Any]) -> None:
+    """Writes the log of a run that has ended; each job of a record has one member."""
+    folder.mkdir(parents=True)
+    now, here = time.time(), {"pid": 1, "host": "h"}
+    whole = [
+        {"event": "start", "time": now, "kind": kind, "agents": agents, **here},
+        *({"time": now, **event} for event in events),
+        {"event": "end", "time": now, "state": "done", **here},
+    ]
+    (folder / EVENTS).write_text("".join(json.dumps(event) + "\n" for event in whole))
+
+
+def curve(job: str, *values: float, of: str = "return", steps: float = 10) -> list[dict[str, Any]]:
+    records = [
+        {"event": "record", "job": job, "step": steps * k, "values": {of: [value]}}
+        for k, value in enumerate(values, 1)
+    ]
+    members = {"event": "running", "job": job, "step": 0, "members": [job]}
+    return [members, *records, {"event": "done", "job": job}]
+
+
+def test_a_run_has_the_color_of_its_place_in_the_list(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    """The second run had the color of the first one's second job."""
+    apart = [event for seed in "012" for event in curve(f"dqn/{seed}", 1.0, 2.0)]
+    finished(tmp_path / "runs" / "seeds", "run", ["dqn"], *apart)
+    both = [*curve("dqn", 3.0, 4.0), *curve("ppo", 5.0, 6.0)]
+    finished(tmp_path / "runs" / "two", "comparison", ["dqn", "ppo"], *both)
+    finished(tmp_path / "runs" / "one", "run", ["dqn"], *curve("", 7.0, 8.0))
+    browser.show(board.url, 1280, "runs.size === 3")
+    browser.evaluate("choose(['seeds', 'two', 'one'].map((name) => "
+                     "[...runs.values()].find((run) => run.name === name).key))")  # fmt: skip
+    browser.wait("document.querySelectorAll('#charts .line').length === 4")
+    inside = "getComputedStyle(item.querySelector('.pick span')).backgroundColor"
+    places = browser.evaluate(
+        "Object.fromEntries([...document.querySelectorAll('#runs li')].map((item) => "
+        f"[item.querySelector('.name').textContent, {inside}]))"
+    )
+    marks = browser.evaluate(
+        "[...document.querySelectorAll('#legend li')].map((item) => { "
+        "const style = getComputedStyle(item.querySelector('path')); "
+        "return [item.textContent, style.stroke, style.strokeDasharray]; })"
+    )
+    assert [mark[0] for mark in marks] == ["seeds", "two · dqn", "two · ppo", "one"]
+    assert len(set(places.values())) == 3
+    assert [mark[1] for mark in marks] == [places[name] for name in ("seeds", "two", "two", "one")]
+    dashes = [mark[2] for mark in marks]
+    assert dashes[0] == dashes[1] == dashes[3] != dashes[2]
+
+
+def test_forty_curves_differ_in_color_or_dash(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    jobs = [event for trial in range(40) for event in curve(f"trial {trial}", 1.0, 2.0)]
+    finished(tmp_path / "runs" / "search", "search", ["dqn"], *jobs)
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 40")
+    looks = browser.evaluate("groups().map((group) => group.color + group.dash)")
+    assert len(set(looks)) == 40
+
+
+def test_seeds_that_train_apart_are_drawn_as_if_together(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    """One is logged at other steps, and its last record comes a little earlier."""
+    first, second = curve("dqn/0", 0.0, 10.0, 20.0), curve("dqn/1", 4.0, 24.0, steps=14)
+    finished(tmp_path / "runs" / "seeds", "run", ["dqn"], *first, *second)
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 1")
+    assert browser.evaluate("document.querySelectorAll('#charts .band').length") == 1
+    points = browser.evaluate("linesOf(groups()[0], 'return')[0].points")
+    there = 4 + 20 * 6 / 14  # on the line between the second one's points
+    assert points == [
+        [10, 2, 0, 4],
+        [20, pytest.approx((10 + there) / 2), 10, pytest.approx(there)],
+        [30, 22, 20, 24],
+    ]
+    assert browser.evaluate("document.querySelectorAll('.cell').length") == 2
+
+
+RESULT = {"growth": -0.00001, "volatility": 0.10125, "sharpe": 0.5325, "drawdown": 0.1263,
+          "turnover": 95.714, "cost_drag": 0.00038951, "regret": 7.8151}  # fmt: skip
+
+
+def test_results_are_percents_where_they_are_shares(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    said = {"event": "result", "values": {"dqn": RESULT, "ppo": {"growth": -0.031, "regret": None}}}
+    finished(tmp_path / "runs" / "us", "backtest", ["dqn", "ppo"], *curve("dqn/2001", 1.0), said)
+    browser.show(board.url, 1280, "!document.getElementById('results').hidden")
+    cells = "[...document.querySelectorAll('#results-rows tr')].map((row) => row.innerText)"
+    first, second = (row.split("\t") for row in browser.evaluate(cells))
+    assert first == ["dqn", "0.00%", "10.13%", "0.532", "12.63%", "95.71", "0.04%", "781.51%"]
+    assert second == ["ppo", "−3.10%", "–", "–", "–", "–", "–", "–"]
+
+
+def test_results_come_before_the_curves_and_keep_words_whole_on_a_phone(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    names = ["pathwise-together", "equal-weight", HOSTILE, "x" * 300]
+    said = {"event": "result", "values": dict.fromkeys(names, RESULT)}
+    finished(tmp_path / "runs" / "us", "backtest", ["dqn"], *curve("dqn/2001", 1.0), said)
+    browser.show(board.url, 390, "!document.getElementById('results').hidden", phone=True)
+    results, curves = (
+        f"document.getElementById('{name}').offsetTop" for name in ("results", "curves")
+    )
+    assert browser.evaluate(f"{results} < {curves}")
+    first = "[...document.querySelectorAll('#results-rows td:first-child')]"
+    assert all(wide >= 112 for wide in browser.evaluate(f"{first}.map((cell) => cell.offsetWidth)"))
+    lines = browser.evaluate(  # of each word, which a hyphen may divide
+        f"{first}.slice(0, 2).map((cell) => {{ const text = cell.firstChild; let end = 0; "
+        "return text.data.split(/(?<=-)/).map((word) => { const range = document.createRange(); "
+        "range.setStart(text, end); range.setEnd(text, end += word.length); "
+        "return new Set([...range.getClientRects()].map((box) => box.top)).size; }); })"
+    )
+    assert lines == [[1, 1], [1, 1]]
+    assert browser.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_a_study_says_where_its_results_are(board: Board, browser: Browser, tmp_path: Path) -> None:
+    finished(tmp_path / "runs" / "study", "study", ["tilts"], *curve("us/lag1/tilts/2001", 1.0))
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 1")
+    assert browser.evaluate("document.getElementById('results').hidden")
+    (tmp_path / "runs" / "study" / "report.html").write_text("<title>study</title>")
+    browser.wait("!document.getElementById('results').hidden")
+    assert "Its report has them" in browser.evaluate("document.getElementById('results').innerText")
+
+
+def test_the_page_says_that_folders_were_left_out(
+    board: Board, browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("first", "second", "third"):
+        finished(tmp_path / "runs" / name, "run", ["dqn"], *curve("", 1.0))
+    monkeypatch.setattr(shelf, "FOLDERS", 3)
+    browser.show(board.url, 1280, "runs.size === 2")
+    said = browser.evaluate("document.getElementById('counts').innerText")
+    assert said == "2 done · only the nearest 3 folders are searched"
+
+
+def test_a_filter_says_how_many_runs_match(board: Board, browser: Browser, tmp_path: Path) -> None:
+    for name in ("first", "second", "third"):
+        finished(tmp_path / "runs" / name, "run", ["dqn"], *curve("", 1.0))
+    browser.show(board.url, 1280, "runs.size === 3")
+
+    def found(text: str) -> list[str]:
+        return browser.evaluate(
+            f"find('filter').value = '{text}'; list(); "
+            "['counts', 'unmatched'].map((id) => find(id).hidden ? '' : find(id).innerText)"
+        )
+
+    assert found("") == ["3 done", ""]
+    assert found("dqn") == ["3 done", ""]
+    assert found("second") == ["1 of 3 runs · 1 done", ""]
+    assert found("xyz") == ["0 of 3 runs", "No run matches this filter."]
+
+
+@pytest.mark.parametrize(("width", "phone"), [(1280, False), (390, True)])
+def test_labels_of_an_axis_stay_in_its_column_and_are_spaced_evenly(
+    board: Board, browser: Browser, tmp_path: Path, width: int, phone: bool
+) -> None:
+    values = curve("", 1000.018, 1000.019, 1000.022, of="loss", steps=100_000)
+    finished(tmp_path / "runs" / "mine", "run", ["dqn"], *values)
+    browser.show(board.url, width, "document.querySelectorAll('#charts .line').length === 1",
+                 phone=phone)  # fmt: skip
+    box = "getBoundingClientRect()"
+    left, right, texts = browser.evaluate(
+        f"(() => {{ const svg = document.querySelector('#charts svg'), at = svg.{box}; "
+        "return [at.left, at.right, [...svg.querySelectorAll('text')].map((text) => "
+        f"{{ const at = text.{box}; return [at.left, at.right, at.top]; }})]; }})()"
+    )
+    assert all(left - 1 <= text[0] and text[1] <= right + 10 for text in texts)
+    low = max(text[2] for text in texts)
+    middles = [(text[0] + text[1]) / 2 for text in texts if text[2] == low]
+    gaps = [b - a for a, b in itertools.pairwise(middles)]
+    assert len(gaps) >= 2
+    assert max(gaps) - min(gaps) < 1
+
+
+def test_the_best_and_the_preset_of_a_search_are_named_so(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    jobs = [*curve("trial 1 to trial 3", 1.0), *curve("best to preset", 2.0)]
+    finished(tmp_path / "runs" / "search", "search", ["dqn"], *jobs)
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 2")
+    for place in ("legend", "matrix"):
+        said = browser.evaluate(f"document.getElementById('{place}').innerText")
+        assert "trial 1 to trial 3" in said
+        assert "best and preset, trained afresh" in said
+
+
+@pytest.mark.parametrize("content", ["", "no log"])
+def test_a_log_that_says_nothing_has_no_time(
+    board: Board, browser: Browser, tmp_path: Path, content: str
+) -> None:
+    folder = tmp_path / "runs" / "odd"
+    folder.mkdir()
+    (folder / EVENTS).write_text(content)
+    os.utime(folder / EVENTS, (1, 1))
+    browser.show(board.url, 1280, "!document.getElementById('shown').hidden")
+    lede = browser.evaluate("document.getElementById('lede').innerText")
+    assert lede == "Stopped. Its log says nothing that can be read."
+    assert browser.evaluate("document.getElementById('facts').innerText") == ""
 
 
 EVIL = """<!doctype html><script>

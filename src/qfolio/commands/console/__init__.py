@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from qfolio.core.text import figure, printable
+from qfolio.core.text import printable
 
 console = Console(highlight=False)
 if not console.is_terminal:
@@ -82,8 +82,3 @@ def print_table(
         cells = (Text(printable(cell)) for cell in row)
         table.add_row(*cells, style="bold" if row[0] in bold else None)
     console.print(table)
-
-
-def number(value: float | None) -> str:
-    """One decimal, or four significant digits for small numbers."""
-    return figure(value, ",.1f" if not value or abs(value) >= 10 else "#.4g")

@@ -22,11 +22,6 @@ def describe_study(study: "Study") -> list[str]:
     return [about, *left_out]
 
 
-def spell(variant: "Variant") -> str:
-    """A variant of a study in words: lag 1, 10 bp."""
-    return f"lag {variant.lag}, {variant.bps:g} bp"
-
-
 def print_study(result: "Result") -> None:
     """A row for each table and each variant pooled, by agent, and the verdicts.
 
@@ -42,7 +37,7 @@ def print_study(result: "Result") -> None:
             for name, known in entry.agents[agent].evidence.items():
                 active = known.to_reference
                 ratios = (active.information_ratio, active.t, known.to_rebalanced.t, known.sharpe)
-                label = name if entry is main else f"{name}, {spell(entry.variant)}"
+                label = name if entry is main else f"{name}, {entry.variant.text}"
                 rows.append((label, *_growth(active), *map(decimal, ratios)))
         for entry in result.variants if several else []:
             found = entry.agents[agent]
@@ -63,7 +58,7 @@ def print_study(result: "Result") -> None:
 
 
 def _pooled(variant: "Variant") -> str:
-    return f"pooled, {spell(variant)}"
+    return f"pooled, {variant.text}"
 
 
 def _growth(entry: "Active | Pooled") -> tuple[str, str]:

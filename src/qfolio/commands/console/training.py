@@ -3,10 +3,10 @@
 import math
 from typing import TYPE_CHECKING, Any
 
-from qfolio.commands.console import number, print_table, say
-from qfolio.core.registry import short
+from qfolio.commands.console import print_table, say
 from qfolio.core.statistics import FEWEST_SEEDS
-from qfolio.core.text import amount, figure
+from qfolio.core.text import amount, figure, four_digits
+from qfolio.report.words import agent_name
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -18,12 +18,12 @@ def describe_run(run: "Run", budget: "Budget") -> list[str]:
     config, planned = run.config, budget.planned(run.population)
     seeds = amount(config.seeds, "seed")
     lines = [
-        f"{short(config.agent).upper()} on {config.task} · preset {config.preset or 'none'} · "
+        f"{agent_name(config.agent)} on {config.task} · preset {config.preset or 'none'} · "
         f"{seeds} · {config.device}"
     ]
     if budget.steps and planned > budget.amount and budget.left(run.population):
         lines.append(
-            f"{budget.amount:,} steps become {planned:,}: {short(config.agent)} takes "
+            f"{budget.amount:,} steps become {planned:,}: {agent_name(config.agent)} takes "
             f"{amount(run.agent.rollout_steps, 'step')} in each of "
             f"{amount(run.agent.num_envs, 'environment')} at once."
         )
@@ -35,7 +35,7 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
     heads = ("seed", "return", "optimum", "regret", "overestimation")
     returns, over = result["return_per_seed"], result["overestimation_per_seed"]
     regrets = result["regret_per_seed"] or [math.nan] * len(returns)
-    optimum = number(result["optimum"])
+    optimum = four_digits(result["optimum"])
     rows = [
         (str(seed), *_cells(optimum, *values))
         for seed, *values in zip(seeds, returns, regrets, over, strict=True)
@@ -46,8 +46,8 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
     )
     print_table(heads, [*rows, ("mean", *_cells(optimum, *means))], width=9)
     if result["return_ci95"]:
-        low, high = result["return_ci95"]
-        say(f"95% interval of the mean return over seeds: {number(low)} to {number(high)}")
+        ends = " to ".join(map(four_digits, result["return_ci95"]))
+        say(f"95% interval of the mean return over seeds: {ends}")
     else:
         say(
             f"An interval over seeds needs a run with {FEWEST_SEEDS} seeds or more; "
@@ -56,7 +56,7 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
 
 
 def _cells(optimum: str, value: float, regret: float, over: float | None) -> tuple[str, ...]:
-    return number(value), optimum, figure(regret, ",.2%"), number(over)
+    return four_digits(value), optimum, figure(regret, ",.2%"), four_digits(over)
 
 
 def print_rule(rule: dict[str, Any]) -> None:

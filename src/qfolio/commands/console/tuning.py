@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qfolio.commands.console import say, tell
-from qfolio.core.registry import short
 from qfolio.core.text import amount, figure
+from qfolio.report.words import agent_name
 
 if TYPE_CHECKING:
     from qfolio.experiments.tuning.run import Tuning
@@ -17,7 +17,7 @@ def describe_search(work: "Tuning") -> list[str]:
     config, budget = work.config, work.config.budget
     seeds = amount(config.seeds, "seed")
     return [
-        f"{short(config.agent).upper()} on {config.task} · preset {config.preset} · "
+        f"{agent_name(config.agent)} on {config.task} · preset {config.preset} · "
         f"{config.trials} trials × {seeds} · {budget.amount:,} {budget.unit} · {config.device}",
         *(f"  {dim.name:<20} {dim}  ({dim.scale})" for dim in work.space),
     ]

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from qfolio.core.text import figure, listed, plural
+from qfolio.core.text import figure, four_digits, listed, plural
 from qfolio.experiments.comparison.ranking import HEADLINE
 
 
@@ -93,13 +93,6 @@ def share(fraction: float) -> str:
         return "0%"
     digits = min(3, max(0, 1 - math.floor(math.log10(size))))
     return f"{figure(100 * fraction, f',.{digits}f')}%"
-
-
-def four_digits(value: float) -> str:
-    """A number with four significant digits."""
-    if abs(float(f"{value:.4g}")) >= 1000:
-        return figure(value, ",.0f")
-    return figure(value, "#.4g" if abs(value) >= 1 else ".4g")
 
 
 def span(seconds: float) -> str:

@@ -31,9 +31,9 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, path_of, read_json
 from qfolio.core.mdp import Agent, Task
-from qfolio.core.notebook import card, number
+from qfolio.core.notebook import card
 from qfolio.core.statistics import interquartile_mean, regret
-from qfolio.core.text import amount, listed
+from qfolio.core.text import amount, four_digits, listed
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range, unlearned
 from qfolio.experiments.comparison.conclusion import conclusion
@@ -45,6 +45,7 @@ from qfolio.experiments.fit import Listener
 from qfolio.experiments.log import JobLog, Log, add_result, seed_names
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.run import Run
+from qfolio.experiments.run_folder import CONFIG
 from qfolio.experiments.seed_groups import FOLDER as SEEDS
 from qfolio.experiments.seed_groups import SeedsJob
 from qfolio.experiments.seeds import TrainedSeeds
@@ -216,7 +217,7 @@ class Comparison:
             known = _measures(self.results[name]) if name in self.results else {}
             seconds = self.results[name].seconds_train if name in self.results else None
             cells = (known.get("return"), known.get("regret"), seconds)
-            rows.append((name, *map(number, cells), self.failures.get(name, "")))
+            rows.append((name, *map(four_digits, cells), self.failures.get(name, "")))
         done = f"{len(self.results)} of {len(self.entrants)} agents"
         seeds = amount(config.seeds, "seed")
         header = ("agent", "return", "regret", "seconds", "")
@@ -391,7 +392,7 @@ class Comparison:
     def _open(self, name: str) -> Run:
         """The agent's run, from its last checkpoint if there is one."""
         entrant, place = self.entrants[name], self.place(name)
-        if (place / "config.json").exists():
+        if (place / CONFIG).exists():
             return Run.open(place)
         return Run.create(
             entrant.task,

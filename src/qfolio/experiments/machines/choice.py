@@ -1,5 +1,7 @@
 """Executors by name, as ``--on`` takes them."""
 
+import re
+
 from qfolio.core.errors import QfolioError, require_type
 from qfolio.experiments.executor import Executor, Here
 
@@ -32,7 +34,7 @@ def on(text: Executor | str | None) -> Executor:
         from qfolio.experiments.machines.processes import Processes
 
         return Processes(int(rest))
-    if text == "ray" or (kind == "ray" and rest.startswith("//") and len(rest) > 2):
+    if text == "ray" or (kind == "ray" and re.fullmatch(r"//.+:\d+", rest)):
         from qfolio.experiments.machines.rays import Ray
 
         return Ray(text if rest else None)

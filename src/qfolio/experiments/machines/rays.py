@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, TypeVar
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, needs
 from qfolio.core.text import amount
 from qfolio.core.version import __version__
 from qfolio.experiments.executor import Job
@@ -167,12 +167,9 @@ class _Actors:
 
 def _connected(address: str | None) -> Any:
     """The module ray, connected to a cluster."""
-    try:
+    missing = 'Ray is not installed; install it with pip install "qfolio[ray]".'
+    with needs("ray", otherwise=missing):
         import ray
-    except ImportError:
-        raise QfolioError(
-            'Ray is not installed; install it with pip install "qfolio[ray]".'
-        ) from None
     if not ray.is_initialized():
         named = address or os.environ.get("RAY_ADDRESS", "")
         try:

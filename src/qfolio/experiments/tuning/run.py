@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Key
 
 from qfolio.core import devices, settings
 from qfolio.core.config import Config, read_config, write_config
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_whole
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import new_folder, path_of, read_json, write_json
 from qfolio.core.host import population_of
@@ -251,7 +251,7 @@ class Tuning:
                     break
                 if listener is not None:
                     listener(now)
-                log.write("result", values=self._results(now.best, now.preset))
+                log.result(self._results(now.best, now.preset))
                 self.interrupted &= now.done < total
             log.settle(not self.interrupted)
 
@@ -406,5 +406,4 @@ def _unlearned(agent: Agent, task: Task, budget: Budget) -> str:
 
 def _require_counts(**counts: int) -> None:
     for name, value in counts.items():
-        if not 1 <= value < 2**20:
-            raise QfolioError(f"{name} is {value}; it must be from 1 to {2**20 - 1}.")
+        require_whole(name, value, 1, 2**20 - 1)

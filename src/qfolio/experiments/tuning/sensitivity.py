@@ -244,12 +244,12 @@ def verdicts(found: Sensitivity | None, trials: Sequence[Trial]) -> list[str]:
     strong = [e for e in loud if e.width < 0.9]
     idle = [e for e in effects if e.share < 0.05 and e.width >= 0.75]
     if strong:
-        names = listed([f"{e.dimension.name} ({percent(e.share)})" for e in strong])
+        names = listed([f"{e.dimension.name} ({e.share:.0%})" for e in strong])
         sentences.append(
             f"What matters most: {names}, by the share of the variation that each explains alone."
         )
     elif loud:
-        names = listed([f"{e.dimension.name} ({percent(e.share)})" for e in loud])
+        names = listed([f"{e.dimension.name} ({e.share:.0%})" for e in loud])
         sentences.append(
             f"The variation comes from {names}, by the share that each explains alone, but hardly "
             f"any value costs more than {found.outcome.tolerance}."
@@ -272,10 +272,6 @@ def verdicts(found: Sensitivity | None, trials: Sequence[Trial]) -> list[str]:
             f"{factor}."
         )
     return sentences
-
-
-def percent(share: float) -> str:
-    return f"{100 * share:.0f}%"
 
 
 def short(value: float) -> str:

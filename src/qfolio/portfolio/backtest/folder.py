@@ -45,10 +45,10 @@ from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.presets import Preset
 from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest.own import KINDS, Own
+from qfolio.portfolio.few_rows import fitted
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.prices.stored import from_arrays, to_arrays
 from qfolio.portfolio.prices.table import Prices
-from qfolio.portfolio.short import fitted
 
 EQUAL_WEIGHT = "equal-weight"
 """The benchmark, unless another is named."""
@@ -227,7 +227,7 @@ class BacktestFolder:
             )
             first = prices.between(0, int(config.prices["rows"]))
         except (KeyError, TypeError, ValueError, QfolioError) as error:
-            raise QfolioError(f"{path} is damaged ({error}); restore it or start over.") from None
+            raise QfolioError(f"{path} is damaged ({error}); restore it, or start over.") from None
         if first.digest != config.prices["digest"]:
             raise QfolioError(f"{path} does not belong to config.json beside it; restore both.")
         return prices, [(int(n), int(rows)) for n, rows in arrays.get("trained", ())]

@@ -17,7 +17,7 @@ from qfolio.portfolio.backtest.folds import spell
 from qfolio.portfolio.backtest.growth import Growth, filled_in
 from qfolio.portfolio.backtest.orders import TOLERANCE
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.mandate.feasible import Mandated
+from qfolio.portfolio.mandate.feasible import TURNOVER_OF_YEAR, Mandated
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.frequency import one_a_day
 from qfolio.portfolio.prices.table import Prices
@@ -187,7 +187,7 @@ def compliance(
     for some, allowed in mandates:
         given = ~np.isnan(decisions[some, 0])
         found = allowed.violations(decisions[some], held[some])
-        found["turnover of the year is too high by"] = -spare[some]
+        found[TURNOVER_OF_YEAR] = -spare[some]
         excess = np.array(list(found.values()))[:, given]
         orders, days = orders + int(given.sum()), days + int((excess > TOLERANCE).any(0).sum())
         for said, by in zip(found, excess, strict=True):

@@ -17,13 +17,12 @@ from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
-from qfolio.portfolio.prices.records import dates_of, in_order, numbers_of
+from qfolio.portfolio.prices.records import date_column, dates_of, in_order, numbers_of
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.prices.vocabulary import (
     ASSET_NAMES,
-    CASH,
-    DATE_NAMES,
     SHARES_NAMES,
+    is_cash,
     plain,
 )
 
@@ -93,7 +92,7 @@ def _from_array(source: Any, prices: Prices) -> Own:
 def _from_table(source: Any, prices: Prices) -> Own:
     table = read(source, lambda names: text_columns(names, None))
     names = [plain(name) for name in table.names]
-    when = next((j for j, name in enumerate(names) if name in DATE_NAMES), 0)
+    when = date_column(table.names)
     others = [j for j in range(len(names)) if j != when and names[j]]
     if not others:
         raise QfolioError(f"the table has no column besides its dates. {FORMS}")
@@ -123,10 +122,7 @@ def _levels(source: Any, others: list[int], unknown: list[str], prices: Prices) 
             raise QfolioError(f"the column {quote(unknown[0])} is not an index: {error}") from None
         index = None
     if index is None or len(index.assets) > 1:
-        raise QfolioError(
-            f"the prices have no asset {quote(unknown[0])}{hint(unknown[0], prices.assets)}. "
-            f"{FORMS}"
-        )
+        raise QfolioError(f"{_unknown(unknown[0], prices)}. {FORMS}")
     return Own("levels", index.dates, index.values[:, 0])
 
 
@@ -153,16 +149,15 @@ def _wide_weights(table: Table, when: int, others: list[int], prices: Prices) ->
 
 
 def _long_weights(table: Table, when: int, asset: int, weight: int, prices: Prices) -> Own:
-    rows, found = dates_of(table, when), numbers_of(table, weight, dates_of(table, when))
+    rows = dates_of(table, when)
+    found = numbers_of(table, weight, rows)
     moments, place = np.unique(rows, return_inverse=True)
     weights = np.full((len(moments), len(prices.assets) + 1), np.nan)
     for i, cell in enumerate(table.columns[asset].tolist()):
         known = _asset(name := label(cell), prices)
         where = f"row {table.first_row + i} ({day(rows[i])})"
         if known is None:
-            raise QfolioError(
-                f"{where}: the prices have no asset {quote(name)}{hint(name, prices.assets)}."
-            )
+            raise QfolioError(f"{where}: {_unknown(name, prices)}.")
         if not np.isnan(weights[place[i], known + 1]):
             raise QfolioError(f"{where}: {quote(name)} appears twice; give one weight per date.")
         weights[place[i], known + 1] = found[i]
@@ -197,24 +192,20 @@ def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Pric
         holding[gone] = 0.0
         for i in np.flatnonzero(rows == row).tolist():
             place = _asset(names[i], prices)
+            where = f"row {table.first_row + i} ({day(dates[i])})"
             if place is None:
-                raise QfolioError(
-                    f"row {table.first_row + i} ({day(dates[i])}): the prices have no asset "
-                    f"{quote(names[i])}{hint(names[i], prices.assets)}."
-                )
+                raise QfolioError(f"{where}: {_unknown(names[i], prices)}.")
             if place == -1:
                 if moments:
                     raise QfolioError(
-                        f"row {table.first_row + i} ({day(dates[i])}): cash is paid in after the "
-                        "first order; give all of it at the date of that order."
+                        f"{where}: cash is paid in after the first order; give all of it at the "
+                        "date of that order."
                     )
                 cash += traded[i]
                 continue
             if gone[place] or np.isnan(close[place]):
                 why = "any more, and was paid out" if gone[place] else "yet"
-                raise QfolioError(
-                    f"row {table.first_row + i} ({day(dates[i])}): {names[i]} has no price {why}."
-                )
+                raise QfolioError(f"{where}: {names[i]} has no price {why}.")
             holding[place] += traded[i]
             cash -= traded[i] * close[place]
         values = np.append(cash, holding * np.nan_to_num(close))
@@ -234,7 +225,11 @@ def _asset(name: str, prices: Prices) -> int | None:
     """The index of an asset, −1 for cash, None if it is unknown."""
     if name in prices.assets:
         return prices.assets.index(name)
-    return -1 if plain(name) == CASH else None
+    return -1 if is_cash(name) else None
+
+
+def _unknown(name: str, prices: Prices) -> str:
+    return f"the prices have no asset {quote(name)}{hint(name, prices.assets)}"
 
 
 def _with_cash(weights: Floats, cash: Floats | None, spelled: list[str]) -> Floats:

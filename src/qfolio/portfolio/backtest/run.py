@@ -33,6 +33,7 @@ from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest import memory, notes
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.benchmark import field_of, tracked
+from qfolio.portfolio.backtest.bound import constant_bound
 from qfolio.portfolio.backtest.folder import (
     MOST_TRIALS,
     AgentConfig,
@@ -40,7 +41,6 @@ from qfolio.portfolio.backtest.folder import (
     BacktestFolder,
 )
 from qfolio.portfolio.backtest.folds import fewest, require_tested, walk_forward
-from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow
 from qfolio.portfolio.backtest.own import Own, place, require_levels
 from qfolio.portfolio.backtest.plan import Plan
@@ -53,8 +53,8 @@ from qfolio.portfolio.mandate.limits import mandate_text, reach
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
+from qfolio.portfolio.prices.extended import require_grown
 from qfolio.portfolio.prices.findings import day
-from qfolio.portfolio.prices.growth import require_grown
 from qfolio.portfolio.prices.table import Prices, describe, load, trials_on
 from qfolio.portfolio.task import Portfolio
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.registry import again
 from qfolio.core.text import amount, listed, near, quote
 from qfolio.core.version import __version__
 from qfolio.portfolio import anchors
@@ -23,8 +24,8 @@ from qfolio.portfolio.calendars import band, decision_rows
 from qfolio.portfolio.desk.allocation import NOISE, Allocation
 from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
-from qfolio.portfolio.desk.rule import Ordered, Rule, Untrained
 from qfolio.portfolio.desk.standing import Kind
+from qfolio.portfolio.desk.untrained import Ordered, Rule, Untrained
 from qfolio.portfolio.policy import UNKNOWN, Policy
 from qfolio.portfolio.prices.findings import Finding, day, first_of
 from qfolio.portfolio.prices.frequency import require_alike, spacing
@@ -74,6 +75,11 @@ class Desk:
     @property
     def ledger(self) -> Ledger:
         return Ledger(self.folder / "ledger")
+
+    @property
+    def resume(self) -> str:
+        """The command line that finishes the backtest, or writes its tables again."""
+        return again("qfolio backtest --resume", self.folder, *self.run.parts)
 
     @property
     def debts(self) -> bool:
@@ -399,16 +405,16 @@ class Desk:
             )
         spent = self.spent(followed, table, record.number)
         whole = record.whole_shares
-        again = Allocation.of(
+        remade = Allocation.of(
             followed, table, shares, cash, whole_shares=whole, spent=spent, debts=self.debts
         )
-        off = float(abs(again.weights - np.array(record.target)).max())
+        off = float(abs(remade.weights - np.array(record.target)).max())
         if off > SAME:
             raise QfolioError(
                 f"{name} gives other weights from the same inputs: one is off by {off:.2g}; use "
                 f"qfolio {record.version}, which made it (this is {__version__})."
             )
-        return record, again
+        return record, remade
 
     def _digests(self, name: str, stored: str | None) -> dict[str, str]:
         """Digests of the run's settings and, with ``stored``, of an agent's policy."""

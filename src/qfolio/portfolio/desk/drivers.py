@@ -19,7 +19,7 @@ from qfolio.portfolio.backtest.attribution.gradients import integrated
 from qfolio.portfolio.backtest.attribution.replays import channel_names
 from qfolio.portfolio.desk.allocation import NOISE, Allocation
 from qfolio.portfolio.following import on_table
-from qfolio.portfolio.mandate.feasible import Feasible, Mandated
+from qfolio.portfolio.mandate.feasible import GROSS, TURNOVER, Feasible, Mandated
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -77,7 +77,7 @@ def reasons(
     required = (np.asarray(nearest, float) - allocation.held)[1:]
     bounds = _bounds(allowed, allocation.weights, allocation.held)
     over = _over(allowed, allocation.weights, allocation.held)
-    beyond = bool(over.get("turnover is too high by", 0.0) > VISIBLE)
+    beyond = bool(over.get(TURNOVER, 0.0) > VISIBLE)
     moved = np.asarray(integrated(task, policy.agent, policy.members, row, held, used)[0])[0]
     names = channel_names(policy.task, policy.features)
     found = []
@@ -121,14 +121,12 @@ def _bounds(allowed: Feasible, weights: np.ndarray, held: np.ndarray) -> list[tu
             each.append(f"its floor of {figure(low, '.2%')}")
     if isinstance(allowed, Mandated):
         over = _over(allowed, weights, held)
-        for name, members in zip(allowed.names, limits.rows != 0, strict=True):
-            if over[name] >= -VISIBLE and not name.startswith("cash is"):
-                group, _, side = name.rpartition(" is ")
-                side = "cap" if side.startswith("above") else "floor"
+        for bound, members in zip(allowed.bounds, limits.rows != 0, strict=True):
+            if over[bound.violation] >= -VISIBLE and bound.what != "cash":
                 for member in np.flatnonzero(members):
-                    found[member].append(f"the {side} of {group}")
-        for said in ("gross exposure", "turnover"):
-            if abs(over[f"{said} is too high by"]) <= VISIBLE:
+                    found[member].append(f"the {bound.side} of {bound.what}")
+        for said, violation in (("gross exposure", GROSS), ("turnover", TURNOVER)):
+            if abs(over[violation]) <= VISIBLE:
                 for each in found:
                     each.append(f"the limit of {said}")
     return [tuple(each) for each in found]

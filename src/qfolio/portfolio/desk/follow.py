@@ -266,10 +266,7 @@ def _tested(desk: Desk, name: str, first: Record) -> np.ndarray:
     if column not in columns:
         column = f"{name}/{desk.run.config.seed}"
     if column not in columns:
-        raise QfolioError(
-            f"returns.csv has no {name}; write it again with qfolio backtest --resume "
-            f"{desk.folder}."
-        )
+        raise QfolioError(f"returns.csv has no {name}; write it again with {desk.resume}.")
     return columns[column][:count]
 
 

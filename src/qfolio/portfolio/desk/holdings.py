@@ -12,7 +12,7 @@ from qfolio.portfolio.desk.orders_csv import spelled
 from qfolio.portfolio.prices.cells import CURRENCIES, is_missing, label, not_a_number, numbers
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.table import Prices
-from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, CASH, SHARES_NAMES, plain
+from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, CASH, SHARES_NAMES, is_cash, plain
 
 
 def read_holdings(
@@ -53,7 +53,7 @@ def read_holdings(
         name, amount = _known(label(cell), assets), float(values[i])
         if not name and is_missing(cells[i]):
             continue
-        if name.lower() == CASH:
+        if is_cash(name):
             name = CASH
             if capital is not None:
                 raise QfolioError(f"{where}: cash is also given by --capital; leave out one.")

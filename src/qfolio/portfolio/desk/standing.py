@@ -57,20 +57,19 @@ class Standing:
                 f"{path} is damaged; write it again with qfolio backtest --resume {shell(folder)}."
             ) from None
 
-    def require_sound(self, folder: Path, named: bool) -> None:
+    def require_sound(self, resume: str, named: bool) -> None:
         """Raises QfolioError unless the policy may be traded without an explicit override.
 
         Args:
-            folder: The backtest's folder, for the message.
+            resume: The command line that finishes the backtest, for the message.
             named: Whether the user named this agent.
         """
         if self.kind != "agent":
             return
         if not self.verdict:
             raise QfolioError(
-                f"The backtest in {folder} is not finished, so it does not say how {self.agent} "
-                "compares with its benchmark; finish it with qfolio backtest --resume "
-                f"{shell(folder)}, or allocate with --anyway."
+                f"The backtest is not finished, so it does not say how {self.agent} compares with "
+                f"its benchmark; finish it with {resume}, or allocate with --anyway."
             )
         if self.worse and not named:
             raise QfolioError(

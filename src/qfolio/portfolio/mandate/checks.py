@@ -92,9 +92,8 @@ def unusual(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
     left = 1 - _most_held(made)
     if left > max(parse(text)[1].cash.min, 0.0) + TINY:
         notes.append(f"The mandate forces at least {_percent(left)} cash: caps allow no more.")
-    for name, row, bound in zip(made.names, limits.rows, limits.most, strict=True):
-        what = name.partition(" is ")[0]
-        if row.min() < 0 and what != "cash":
+    for (what, side), row, bound in zip(made.bounds, limits.rows, limits.most, strict=True):
+        if side == "floor" and row.any():
             found = _found(limits, value=-row)
             assert found is not None
             count = limits.low.size
@@ -202,10 +201,9 @@ def relaxed(made: Mandated) -> tuple[Mandated, list[str]]:
         )
     extra = short + found[2 * count :]
     extra = np.where(extra > TINY, extra + TINY, 0.0)
-    names = [name for name, more in zip(made.names, extra, strict=True) if more > 0]
     eased = made.limits._replace(most=made.limits.most + extra)
-    lowered = [f"{name.partition(' is ')[0]} by {_percent(more)}"
-               for name, more in zip(names, extra[extra > 0], strict=True)]  # fmt: skip
+    lowered = [f"{bound.what} by {_percent(more)}"
+               for bound, more in zip(made.bounds, extra, strict=True) if more > 0]  # fmt: skip
     return dataclasses.replace(made, limits=eased), lowered
 
 
@@ -332,20 +330,11 @@ def _said(text: str, made: Mandated, most: float) -> list[str]:
     _, mandate = parse(text)
     said = [f"the caps of assets{_spelled(mandate.assets.cap, most if most < 1 else np.inf)}"]
     said.append(f"the floors of assets{_spelled(mandate.assets.floor)}")
-    for name, row, bound in zip(made.names, made.limits.rows, made.limits.most, strict=True):
-        what, falls = name.partition(" is ")[0], row.min() < 0
-        if what == "cash":
-            said.append(
-                f"cash of at {'most' if falls else 'least'} {_percent(_cash(bound, falls))}"
-            )
-        else:
-            given = f"least {_percent(-bound)}" if falls else f"most {_percent(bound)}"
-            said.append(f"{what} of at {given}")
+    for (what, side), bound in zip(made.bounds, made.limits.most, strict=True):
+        least = side in ("minimum", "floor")
+        share = {"minimum": 1 - bound, "maximum": 1 + bound, "floor": -bound, "cap": bound}[side]
+        said.append(f"{what} of at {'least' if least else 'most'} {_percent(share)}")
     return [*said, f"gross exposure of at most {_percent(float(made.limits.gross))}"]
-
-
-def _cash(bound: float, falls: bool) -> float:
-    return 1 + bound if falls else 1 - bound
 
 
 def _spelled(given: float | dict[str, float], most: float = np.inf) -> str:

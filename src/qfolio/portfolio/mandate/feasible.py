@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +15,24 @@ from qfolio.core.arrays import Bools, Floats
 from qfolio.portfolio.mandate.order import BARELY, Rules, ordered
 from qfolio.portfolio.mandate.projection import Limits
 from qfolio.portfolio.mandate.risk import Past, Risk
+
+GROSS = "gross exposure is too high by"
+TURNOVER = "turnover is too high by"
+TURNOVER_OF_YEAR = "turnover of the year is too high by"
+"""Names of violations of a mandate."""
+
+
+class Bound(NamedTuple):
+    """One side of what a mandate limits."""
+
+    what: str  # cash, or a group
+    side: Literal["minimum", "maximum", "floor", "cap"]
+
+    @property
+    def violation(self) -> str:
+        """The name of its violation."""
+        where = "above" if self.side in ("maximum", "cap") else "below"
+        return f"{self.what} is {where} its {self.side} by"
 
 
 class Feasible(eqx.Module):
@@ -94,7 +112,7 @@ class Mandated(Feasible):
     """
 
     limits: Limits
-    names: tuple[str, ...] = eqx.field(static=True)  # of the rows of the limits
+    bounds: tuple[Bound, ...] = eqx.field(static=True)  # the rows of the limits
     holdings: int = eqx.field(static=True, default=0)  # at most so many; 0: any number
     smallest_trade: float = eqx.field(static=True, default=0.0)
     exposure: float = eqx.field(static=True, default=1.0)  # largest sum of absolute weights
@@ -190,16 +208,16 @@ class Mandated(Feasible):
             "the sum is off 1 by": abs(weights.sum(-1) - 1),
             "a weight is below its floor by": (low - assets).max(-1),
             "a weight is above its cap by": (assets - high).max(-1),
-            "gross exposure is too high by": abs(assets).sum(-1) - gross,
+            GROSS: abs(assets).sum(-1) - gross,
         }
         over = assets @ rows.T - most
-        found |= {name: over[..., i] for i, name in enumerate(self.names)}
+        found |= {bound.violation: over[..., i] for i, bound in enumerate(self.bounds)}
         if self.holdings:
             count = (abs(assets) > BARELY).sum(-1)
             found["the number of holdings is too high by"] = count - 1.0 * self.holdings
         if held is not None:
             change = abs(assets - held[..., 1:])
-            found["turnover is too high by"] = change.sum(-1) - turnover
+            found[TURNOVER] = change.sum(-1) - turnover
             made = xp.where(change > BARELY, self.smallest_trade - change, -1.0)
             found["a trade is too small by"] = made.max(-1)
         return found

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.mandate.feasible import Mandated
+from qfolio.portfolio.mandate.feasible import Bound, Mandated
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.mandate.projection import Limits
 
@@ -52,23 +52,23 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
     long = mandate.cash.min >= 0 and bool(floor.min() >= 0)
     most = most if long or most < 1 else np.inf
     high, low = np.where(can, np.minimum(cap, most), 0.0), np.where(can, floor, 0.0)
-    rows, limits, names = [], [], []
+    rows, limits, bounds = [], [], []
 
-    def limit(row: np.ndarray, at_most: float, name: str) -> None:
+    def limit(row: np.ndarray, at_most: float, bound: Bound) -> None:
         rows.append(row)
         limits.append(at_most)
-        names.append(name)
+        bounds.append(bound)
 
     ones = np.ones(len(assets))
-    limit(ones, 1 - mandate.cash.min, "cash is below its minimum by")
+    limit(ones, 1 - mandate.cash.min, Bound("cash", "minimum"))
     if mandate.cash.max < 1 or floor.min() < 0:
-        limit(-ones, mandate.cash.max - 1, "cash is above its maximum by")
+        limit(-ones, mandate.cash.max - 1, Bound("cash", "maximum"))
     for column, value, group in mandate.every_group:
         members = 1.0 * np.isin(assets, group.assets)
         if group.cap is not None:
-            limit(members, group.cap, f"{column} {value} is above its cap by")
+            limit(members, group.cap, Bound(f"{column} {value}", "cap"))
         if group.floor is not None:
-            limit(-members, -group.floor, f"{column} {value} is below its floor by")
+            limit(-members, -group.floor, Bound(f"{column} {value}", "floor"))
     trading, exposure = mandate.trading, mandate.exposure.gross
     most_gross = float(np.maximum(abs(cap), abs(floor)).sum())
     return Mandated(
@@ -80,7 +80,7 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
             np.array(exposure or np.inf),
             np.array(trading.turnover or np.inf),
         ),
-        tuple(names),
+        tuple(bounds),
         trading.holdings or 0,
         trading.smallest_trade,
         1.0 if long else min(exposure or most_gross, most_gross),

@@ -11,8 +11,8 @@ from qfolio.portfolio.prices.dates import read_dates
 from qfolio.portfolio.prices.findings import day, listing
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
-from qfolio.portfolio.prices.records import in_order
-from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, DATE_NAMES, plain
+from qfolio.portfolio.prices.records import date_column, in_order
+from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, plain
 
 SPANS = ("from", "to")
 TRUTH = {"true": 1, "false": 0}
@@ -32,7 +32,7 @@ def membership(source: Any, dates: np.ndarray, assets: tuple[str, ...]) -> np.nd
         QfolioError: The source cannot be read, or does not say when each asset is a member.
     """
     table = read(
-        source, lambda names: set(range(len(names))) if _spans(names) else {_date_column(names)}
+        source, lambda names: set(range(len(names))) if _spans(names) else {date_column(names)}
     )
     try:
         _require_kind(table.names)
@@ -56,14 +56,8 @@ def _require_kind(names: tuple[str, ...]) -> None:
         )
 
 
-def _date_column(names: tuple[str, ...]) -> int:
-    """The first, unless it has no name, such as row numbers, and another is called date."""
-    dated = (j for j, name in enumerate(names) if plain(name) in DATE_NAMES)
-    return next(dated, 0) if names and not names[0] else 0
-
-
 def _of_rows(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.ndarray:
-    when = _date_column(table.names)
+    when = date_column(table.names)
     _require_all([name for j, name in enumerate(table.names) if j != when], assets)
     since = _dates(table, when)
     if np.isnat(since).any():

@@ -9,6 +9,7 @@ from qfolio.portfolio.prices.frequency import every_day, spacing
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Block, Grid, report_cells
 from qfolio.portfolio.prices.returns import RUIN, look_like_returns
+from qfolio.portfolio.prices.vocabulary import is_cash
 
 FEWEST_ROWS, FEW_ROWS = 3, 60
 
@@ -19,7 +20,7 @@ def check_cells(grid: Grid, findings: Findings) -> None:
     if not grid.assets:
         findings.error("there is no asset", advice="Give a column of prices for each asset.")
     for name in grid.assets:
-        if name.strip().lower() == "cash":
+        if is_cash(name):
             findings.error(
                 f"the asset {quote(name)} has the name of the money that is not invested",
                 advice="Rename or remove it." if grid.long else "Rename or remove its column.",

@@ -11,6 +11,13 @@ from qfolio.portfolio.prices.cells import not_a_number, numbers
 from qfolio.portfolio.prices.dates import read_dates
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.layout import Table
+from qfolio.portfolio.prices.vocabulary import DATE_NAMES, plain
+
+
+def date_column(names: tuple[str, ...]) -> int:
+    """The column of dates: one that is called so, else the first."""
+    known = [plain(name) for name in names]
+    return next((known.index(name) for name in DATE_NAMES if name in known), 0)
 
 
 def dates_of(table: Table, column: int) -> np.ndarray:

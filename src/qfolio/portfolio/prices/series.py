@@ -9,7 +9,7 @@ from qfolio.core.text import quote
 from qfolio.portfolio.prices.findings import Findings, day, listing
 from qfolio.portfolio.prices.frequency import spacing
 from qfolio.portfolio.prices.reading import read
-from qfolio.portfolio.prices.records import dates_of, in_order, numbers_of
+from qfolio.portfolio.prices.records import date_column, dates_of, in_order, numbers_of
 
 LATE, MISSED = 7.0, 3.0
 """How old the last number may be: a week, or three times the days that are usual between two."""
@@ -30,18 +30,17 @@ def series(source: Any, name: str, dates: np.ndarray, findings: Findings) -> np.
     Raises:
         QfolioError: The source cannot be read, lacks the column, or begins after the prices.
     """
-    table = read(source, lambda names: {0})
+    table = read(source, lambda names: {date_column(names)})
     try:
-        if len(table.names) == 2:
-            column = 1
-        elif name in table.names[1:]:
-            column = table.names.index(name)
-        else:
+        when = date_column(table.names)
+        others = [j for j in range(len(table.names)) if j != when]
+        column = next((j for j in others if len(others) == 1 or table.names[j] == name), None)
+        if column is None:
             raise QfolioError(
                 f"it has the columns {listing(table.names)}; keep dates and one of numbers, or "
                 f"call a column {quote(name)}."
             )
-        since = dates_of(table, 0)
+        since = dates_of(table, when)
         values = numbers_of(table, column, since)
         order = in_order(since, table)
         latest = np.searchsorted(since[order], dates, side="right") - 1

@@ -24,6 +24,7 @@ from qfolio.portfolio.prices.frequency import periods_per_year
 from qfolio.portfolio.prices.grid import Grid
 from qfolio.portfolio.prices.members import membership
 from qfolio.portfolio.prices.series import series
+from qfolio.portfolio.prices.vocabulary import is_cash
 
 DEFAULT_SOURCE = "skfolio: 20 US stocks"
 DEFAULT_NOTE = (
@@ -99,7 +100,7 @@ class Prices:
             )
         if len(set(assets)) < len(assets) or len({*channels, *shared}) < len(channels + shared):
             raise QfolioError("names of assets, features and columns must not repeat.")
-        if "cash" in map(str.lower, assets):
+        if any(map(is_cash, assets)):
             raise QfolioError("an asset cannot be called cash, which is money; rename the column.")
         if np.isnat(dates).any() or (np.diff(dates) <= np.timedelta64(0, "s")).any():
             raise QfolioError("dates must increase from row to row.")

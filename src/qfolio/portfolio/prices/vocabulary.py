@@ -39,6 +39,11 @@ def plain(name: str) -> str:
     return " ".join(re.sub(r"[-_.<>\s]+", " ", name.lower()).split())
 
 
+def is_cash(name: str) -> bool:
+    """Whether this is the name of the money that is not invested."""
+    return plain(name) == CASH
+
+
 def kind(name: str) -> str | None:
     """The kind of a column of this name (a key of ``KINDS``); None for any other name."""
     return _KIND.get(plain(name))

@@ -44,6 +44,11 @@ class Variant(msgspec.Struct, frozen=True):
         """Its name as a folder: lag1-10bp."""
         return f"lag{self.lag}-{self.bps:g}bp"
 
+    @property
+    def text(self) -> str:
+        """In words: lag 1, 10 bp."""
+        return f"lag {self.lag}, {self.bps:g} bp"
+
 
 class TableConfig(msgspec.Struct, frozen=True, kw_only=True):
     """A table of the study."""

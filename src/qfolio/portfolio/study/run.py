@@ -28,7 +28,8 @@ from qfolio.core.errors import (
 from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
-from qfolio.core.text import amount, near, shell
+from qfolio.core.registry import again
+from qfolio.core.text import amount, near
 from qfolio.experiments.executor import Executor
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
@@ -39,11 +40,11 @@ from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.folder import MOST_TRIALS
 from qfolio.portfolio.backtest.folds import parse_length, require_fold, require_tested
 from qfolio.portfolio.backtest.replay import Entry
-from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
 from qfolio.portfolio.backtest.statistics.estimates import SHORTEST
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
+from qfolio.portfolio.backtest.writing import write_tables
 from qfolio.portfolio.prices.table import Prices, describe, load
 from qfolio.portfolio.study.folder import (
     NAME,
@@ -54,9 +55,9 @@ from qfolio.portfolio.study.folder import (
     TableConfig,
     Variant,
 )
-from qfolio.portfolio.study.result import summarize
+from qfolio.portfolio.study.summary import summarize
 from qfolio.portfolio.study.training import Listen, Trainings, of_table
-from qfolio.portfolio.study.verdict import decimal, percent
+from qfolio.portfolio.study.verdict import decimal, growth_text
 
 Report = Callable[[Backtest, dict[str, Entry], Assessment, list[str], Why | None], None]
 
@@ -201,7 +202,7 @@ class Study:
         config = self.config
         agents = config.result.variants[0].agents if config.result else {}
         rows = [
-            (name, percent(each.growth), decimal(each.z), each.finding or "")
+            (name, growth_text(each.growth), decimal(each.z), each.finding or "")
             for name, each in ((name, pools.to_reference) for name, pools in agents.items())
         ]
         facts = [
@@ -232,6 +233,11 @@ class Study:
             raise QfolioError(f"The study has no table {table!r}; {known}")
         place = self._files.place(table, variant or self.config.variants[0])
         return Backtest.open(place, self._agents)
+
+    @property
+    def parts(self) -> list[object]:
+        """Those of each backtest, which may be of a user's own modules."""
+        return self.backtest(next(iter(self.config.tables))).parts
 
     def run(
         self,
@@ -303,10 +309,8 @@ class Study:
         """
         config = self.config
         if not self._complete:
-            raise QfolioError(
-                "The study is not finished; continue with qfolio study --resume "
-                f"{shell(self.folder)}."
-            )
+            resume = again("qfolio study --resume", self.folder, *self.parts)
+            raise QfolioError(f"The study is not finished; continue with {resume}.")
         result = summarize(
             config,
             [

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from qfolio.core.text import amount, figure, plural
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT
 from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
-from qfolio.portfolio.backtest.statistics.verdict import p_text
+from qfolio.portfolio.backtest.statistics.verdict import at_any_speed, at_best_speed, p_text
 from qfolio.portfolio.study.folder import Result
 from qfolio.portfolio.study.pooling import Pooled, Pools
 
@@ -37,9 +37,9 @@ def _findings(name: str, pools: Pools, threshold: float) -> list[str]:
     found = f"{_VERBS[alone.finding or 'none'].format(name)} {reference} {where}"
     if reference != EQUAL_WEIGHT:
         return [f"{found}: {of_alone}."]
-    at_best = f"the best rebalancing of {reference}"
+    at_best = at_best_speed(reference)
     if best.finding == "better":
-        found = f"{name} beats {reference}, however it is rebalanced, {where}"
+        found = f"{name} beats {at_any_speed(reference)} {where}"
         also = f"Against {reference} itself, rebalanced as often as it may be"
     elif alone.finding == "better":
         found = f"No evidence that {name} beats {at_best} {where}"
@@ -54,13 +54,13 @@ def _reference(pools: Pools) -> str:
 
 
 def _numbers(pooled: Pooled, threshold: float, tables: int) -> str:
-    interval = f"95% interval {percent(pooled.low)} to {percent(pooled.high)}"
+    interval = f"95% interval {growth_text(pooled.low)} to {growth_text(pooled.high)}"
     chance = "" if pooled.p_holm is None else f", corrected p {p_text(pooled.p_holm)}"
     if pooled.finding == "none" and pooled.p_holm is not None and pooled.p_holm <= 1 - LEVEL:
         chance += f", but luck is expected to reach a z of {decimal(threshold)} after all looks"
     difference, z = ("difference", "z") if tables == 1 else ("mean difference", "Stouffer’s z")
     return (
-        f"the {difference} in annual growth is {percent(pooled.growth)} ({interval}); "
+        f"the {difference} in annual growth is {growth_text(pooled.growth)} ({interval}); "
         f"{z} is {decimal(pooled.z)}{chance}"
     )
 
@@ -74,9 +74,8 @@ def _tables(pools: Pools) -> list[str]:
     grew = f"It grew more than {worst.reference} on {count} of {amount(total, 'table')}"
     if worst.reference == EQUAL_WEIGHT:
         grew += f", and more than its best rebalancing on {pools.to_rebalanced.positive}"
-    return [
-        f"{grew}. Its worst table is {pools.to_reference.worst} ({percent(worst.growth)} a year)."
-    ]
+    least = f"{pools.to_reference.worst} ({growth_text(worst.growth)} a year)"
+    return [f"{grew}. Its worst table is {least}."]
 
 
 def _sharpe(pools: Pools) -> str:
@@ -110,7 +109,7 @@ def looks_sentence(result: Result) -> str:
     return sentence
 
 
-def percent(value: float | None) -> str:
+def growth_text(value: float | None) -> str:
     """A growth with its sign; two decimals if it is small."""
     if value is None:
         return "undefined"

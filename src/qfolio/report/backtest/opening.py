@@ -12,7 +12,14 @@ from qfolio.core.text import listed
 from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment
 from qfolio.portfolio.backtest.statistics.differences import Difference
 from qfolio.portfolio.backtest.statistics.estimates import Measured
-from qfolio.portfolio.backtest.statistics.verdict import claims, comparable, p_text, wiped_out
+from qfolio.portfolio.backtest.statistics.verdict import (
+    at_any_speed,
+    at_best_speed,
+    claims,
+    comparable,
+    p_text,
+    wiped_out,
+)
 from qfolio.report.axis import Axis, ticks_around
 from qfolio.report.backtest.data import BacktestData, followed_names, shown_order
 from qfolio.report.rendering import number, percent
@@ -115,8 +122,7 @@ def conclusion(data: BacktestData) -> str:
 
 def _others(names: list[str], test: Assessment, better: bool = False) -> str:
     """What the first verdicts on some agents compare them with, in words."""
-    at_any = f"{test.reference}, however it is rebalanced,"
-    slower = at_any if better else f"the best rebalancing of {test.reference}"
+    slower = (at_any_speed if better else at_best_speed)(test.reference)
     said = [
         slower if against(name, test) is test.strategies[name].to_rebalanced else test.reference
         for name in names

@@ -19,7 +19,7 @@ from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL
 from qfolio.report.axis import Axis
 from qfolio.report.backtest.data import BacktestData, main_names
 from qfolio.report.backtest.facts import basis_points
-from qfolio.report.rendering import number, percent
+from qfolio.report.rendering import number, percent, shade
 
 HEADINGS = {
     "growth": "Growth",
@@ -285,9 +285,7 @@ def month_tables(names: list[str], data: BacktestData) -> list[tuple[str, list[_
     def cell(value: float) -> tuple[str, str]:
         if math.isnan(value):
             return "", ""
-        level = min(math.ceil(5 * abs(value) / scale - 1e-9), 5)
-        shade = f"{'gain' if value > 0 else 'loss'}{level}" if level else ""
-        return number(100 * value), shade
+        return number(100 * value), shade(value / scale)
 
     return [
         (

@@ -138,7 +138,7 @@ class Job:
         if said.event == "running":
             self.worker, self.members, self.begun = said.worker, said.members, said.time
             self.ended, self.step = None, said.step or 0.0
-            self.share, self.rate, self.left = said.share or 0.0, None, None
+            self.share, self.rate, self.left = _share(said.share or 0.0), None, None
             for curve in self.curves.values():
                 curve.cut(self.step)
         else:
@@ -149,7 +149,7 @@ class Job:
     def record(self, said: Record) -> None:
         self.step = max(self.step, said.step)
         if said.share is not None:
-            self.share, self.rate, self.left = said.share, said.rate, said.left
+            self.share, self.rate, self.left = _share(said.share), said.rate, said.left
         for name, values in said.values.items():
             if name != "episode":
                 self.curves.setdefault(name, Curve()).add(said.step, values)
@@ -213,7 +213,7 @@ class Experiment:
         except OSError:  # deleted, or on a disk that is gone
             self.known = True
             return
-        seen = (self.known, self.state, (self.log.parent / REPORT).exists())
+        seen = (self.known, self.state, self._has_report)
         if seen != self._seen:
             self._seen, self.version = seen, version
 
@@ -222,6 +222,12 @@ class Experiment:
         if self._working and self._alive:
             return "running"
         return "stopped" if self.end is None else self.end.state
+
+    @property
+    def _has_report(self) -> bool:
+        """Whether its report can be opened; a link is not followed."""
+        report = self.log.parent / REPORT
+        return report.is_file() and not report.is_symlink()
 
     @property
     def _alive(self) -> bool:
@@ -282,7 +288,10 @@ class Experiment:
         return sum(job.share for job in self.jobs.values()) / max(len(self.jobs), 1)
 
     def summary(self, key: str) -> dict[str, Any]:
-        """The entry in the list of experiments; key: the page's key for the experiment."""
+        """The entry in the list of experiments, with None where its log says nothing.
+
+        key: the page's key for the experiment.
+        """
         states = [job.state for job in self.jobs.values()]
         jobs = self.jobs.values() if self.state == "running" else ()
         running = [job for job in jobs if job.state == "running"]
@@ -291,12 +300,13 @@ class Experiment:
         return {
             "key": key, "name": self.name, "state": self.state, "kind": self.about.kind,
             "task": self.about.task, "agents": self.about.agents, "seeds": self.about.seeds,
-            "share": self.share, "begun": self.begun, "last": self.last, "paused": self.paused,
+            "share": self.share if self.jobs else None,
+            "begun": self.begun, "last": self.last or None, "paused": self.paused,
             "rate": sum(job.rate or 0.0 for job in running) or None,
             "jobs": {state: states.count(state) for state in sorted(set(states))},
             "workers": len({job.worker for job in running if job.worker}),
             "host": self.about.host, "error": self.end.error if self.end else "",
-            "report": (self.log.parent / REPORT).is_file(), "spark": spark,
+            "report": self._has_report, "spark": spark,
         }  # fmt: skip
 
     def detail(self, since: int) -> dict[str, Any]:
@@ -314,6 +324,10 @@ class Experiment:
 def thinned(points: list[Point], most: int) -> list[Point]:
     """At most about so many of the points, evenly spaced, the last one among them."""
     return points[:: -max(1, -(-len(points) // most))][::-1]
+
+
+def _share(said: float) -> float:
+    return min(max(said, 0.0), 1.0)
 
 
 def _first_line(log: Path) -> bytes:

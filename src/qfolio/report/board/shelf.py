@@ -3,7 +3,7 @@
 import hashlib
 import os
 import threading
-from collections.abc import Iterator
+from collections import deque
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -11,8 +11,8 @@ from typing import Any
 from qfolio.experiments.events import CONTRAST, EVENTS
 from qfolio.report.board.experiment import REPORT, Experiment
 
-DEPTH = 4
-"""How deep folders are searched; what lies within an experiment is its own, except a contrast."""
+FOLDERS = 10_000
+"""Maximum number of folders searched, the nearest first."""
 
 FRESH = 0.3
 """Seconds for which further requests are answered without reading again."""
@@ -31,12 +31,14 @@ class Shelf:
         self.root = root.resolve()
         self._experiments: dict[str, Experiment] = {}
         self._version, self._read = 0, -FRESH
+        self._searched = True
         self._lock = threading.Lock()
 
     def runs(self, since: int) -> dict[str, Any]:
         """The summaries of experiments that have changed, and the keys of all.
 
-        Those whose logs are still being read for the first time are only counted.
+        Those whose logs are still being read for the first time are only counted. ``searched``:
+        how many folders were searched if there are more.
         """
         with self._lock:
             self._refresh()
@@ -45,6 +47,7 @@ class Shelf:
                 "version": self._version,
                 "root": _readable(self.root.name),
                 "reading": len(self._experiments) - len(known),
+                "searched": None if self._searched else FOLDERS,
                 "keys": list(known),
                 "runs": [
                     experiment.summary(key)
@@ -83,7 +86,8 @@ class Shelf:
             return
         self._version += 1
         found = {}
-        for log in _logs(str(self.root), DEPTH):
+        logs, self._searched = _logs(str(self.root), FOLDERS)
+        for log in logs:
             path = Path(log)
             name = path.parent.relative_to(self.root).as_posix()
             name = self.root.name if name == "." else name
@@ -101,20 +105,27 @@ def _readable(name: str) -> str:
     return name.encode(errors="surrogateescape").decode(errors="replace")
 
 
-def _logs(folder: str, depth: int) -> Iterator[str]:
-    """Paths of the logs below a folder; links are not followed."""
-    try:
-        with os.scandir(folder) as entries:
-            inside = [entry for entry in entries if not entry.name.startswith(".")]
-            folders = [entry.path for entry in inside if entry.is_dir(follow_symlinks=False)]
-            if any(e.name == EVENTS and e.is_file(follow_symlinks=False) for e in inside):
-                yield os.path.join(folder, EVENTS)
-                folders, depth = [path for path in folders if Path(path).name == CONTRAST], 1
-    except OSError:
-        return
-    if depth:
-        for path in folders:
-            yield from _logs(path, depth - 1)
+def _logs(root: str, most: int) -> tuple[list[str], bool]:
+    """Paths of the logs below a folder, and whether all its folders were searched.
+
+    What lies within an experiment is its own, except a contrast. Links are not followed.
+    """
+    logs, folders = [], deque([root])
+    for _ in range(most):
+        if not folders:
+            break
+        folder = folders.popleft()
+        try:
+            with os.scandir(folder) as entries:
+                inside = [entry for entry in entries if not entry.name.startswith(".")]
+                below = [entry.path for entry in inside if entry.is_dir(follow_symlinks=False)]
+                if any(e.name == EVENTS and e.is_file(follow_symlinks=False) for e in inside):
+                    logs.append(os.path.join(folder, EVENTS))
+                    below = [path for path in below if os.path.basename(path) == CONTRAST]
+        except OSError:
+            continue
+        folders.extend(below)
+    return logs, not folders
 
 
 def _is_plain(path: Path, root: Path) -> bool:

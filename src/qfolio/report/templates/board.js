@@ -4,6 +4,7 @@
 
 const EVERY = 700; // milliseconds between two questions
 const COLORS = 6; // then they come again, dashed
+const SHARES = ["growth", "volatility", "drawdown", "cost_drag", "regret"]; // results in percent
 const STATES = ["running", "done", "stopped", "failed"];
 const NAMES = { // what curves show, the most telling first
   "return": "Return in training", "greedy return": "Greedy return", "greedy regret": "Greedy regret",
@@ -20,7 +21,7 @@ const find = (id) => document.getElementById(id);
 const runs = new Map(); // key → what the list says
 const details = new Map(); // key → {version, jobs, results}
 const items = new Map(); // key → its place in the list
-let version = 0, reading = 0, chosen = [], following = true, connected = true, hovered = null;
+let version = 0, reading = 0, searched = null, chosen = [], following = true, connected = true, hovered = null;
 
 // Elements ------------------------------------------------------------------------------------
 
@@ -44,6 +45,7 @@ function say(node, text) {
 // Words ---------------------------------------------------------------------------------------
 
 const THIN = "\u202f";
+const LONG = 1e9; // seconds that are no time of a run
 
 function number(x) {
   if (x === null || x === undefined || !Number.isFinite(x)) return "–";
@@ -57,15 +59,22 @@ function number(x) {
   return text.replace("-", "−");
 }
 
-function short(x) { // of an axis, whose ticks are round but for the last digits of sums
-  const size = Math.abs(x);
-  const cut = (y) => String(+y.toPrecision(12));
-  const text = size >= 1e9 ? (+x.toPrecision(12)).toExponential() : size >= 1e6 ? `${cut(x / 1e6)}M` : size >= 1e4 ? `${cut(x / 1e3)}k` : cut(x);
-  return text.replace("-", "−");
+function result(name, x) {
+  if (!SHARES.includes(name) || !Number.isFinite(x)) return number(x);
+  if (Math.abs(x) >= 10) return `${number(100 * x)}%`;
+  return `${(100 * x).toFixed(2)}%`.replace(/^-(?!0\.00%)/, "−").replace("-", "");
+}
+
+function labels(values) { // of the ticks of an axis, all in one unit
+  const most = Math.max(...values.map(Math.abs));
+  const power = most >= 1e9 || most > 0 && most < 1e-4 ? Math.floor(Math.log10(most)) : most >= 1e6 ? 6 : most >= 1e4 ? 3 : 0;
+  const unit = { 0: "", 3: "k", 6: "M" }[power] ?? `e${power < 0 ? "" : "+"}${power}`;
+  const digits = (x) => String(+(x / 10 ** power).toPrecision(12)); // without the last ones of sums
+  return values.map((x) => (x === 0 ? "0" : digits(x) + unit).replaceAll("-", "−"));
 }
 
 function span(seconds) {
-  if (seconds === null || !Number.isFinite(seconds)) return "–";
+  if (seconds === null || !(Math.abs(seconds) < LONG)) return "–";
   const s = Math.round(Math.max(seconds, 0));
   if (s < 90) return `${s}${THIN}s`;
   const m = Math.round(s / 60);
@@ -74,7 +83,11 @@ function span(seconds) {
   return `${Math.round(s / 86400)} days`;
 }
 
-const ago = (time) => `${span(Date.now() / 1000 - time)} ago`;
+function ago(time) { // empty if that is not known
+  const seconds = Date.now() / 1000 - time;
+  return Math.abs(seconds) < LONG ? `${span(seconds)} ago` : "";
+}
+
 const percent = (x) => `${Math.floor(100 * x)}%`;
 const plural = (count, noun) => `${number(count).replace(/[.].*/, "")} ${noun}${count === 1 ? "" : "s"}`;
 const tail = (name) => name.split(":").pop();
@@ -108,7 +121,7 @@ function item(run) {
   get(".name").title = run.name;
   say(get(".what"), what(run));
   get(".pick").setAttribute("aria-label", `Compare ${run.name}`);
-  get("i").style.transform = `scaleX(${run.share})`;
+  get("i").style.transform = `scaleX(${run.share ?? 0})`;
   get("path").setAttribute("d", line(run.spark));
   return place;
 }
@@ -124,22 +137,28 @@ function list() {
   const wanted = find("filter").value.toLowerCase().split(/\s+/).filter(Boolean);
   const sorted = [...runs.values()].sort((a, b) =>
     (b.state === "running") - (a.state === "running") || b.begun - a.begun || (a.name < b.name ? -1 : 1));
+  const shown = new Set(sorted.filter((run) => {
+    const text = `${run.name} ${what(run)} ${run.state}`.toLowerCase();
+    return wanted.every((word) => text.includes(word));
+  }));
   sorted.forEach((run, i) => {
     const place = items.get(run.key), color = chosen.indexOf(run.key);
-    const text = `${run.name} ${what(run)} ${run.state}`.toLowerCase();
-    place.hidden = !wanted.every((word) => text.includes(word));
+    place.hidden = !shown.has(run);
     place.className = `${run.state}${color < 0 ? "" : " chosen"}`;
     place.style.setProperty("--line", color < 0 ? "" : `var(--agent-${color % COLORS + 1})`);
     place.querySelector(".pick").setAttribute("aria-pressed", color >= 0);
-    say(place.querySelector(".when"), run.state === "running" ? percent(run.share)
-      : run.state === "done" ? ago(run.last) : run.state);
+    const when = run.state === "running" ? run.share !== null && percent(run.share) : run.state === "done" && ago(run.last);
+    say(place.querySelector(".when"), when || run.state);
     if (find("runs").children[i] !== place) find("runs").insertBefore(place, find("runs").children[i] || null);
   });
-  const counts = STATES.map((state) => [state, sorted.filter((run) => run.state === state).length]);
-  const text = [...counts, ["being read", reading]].filter(([, n]) => n)
-    .map(([state, n]) => `${n} ${state}`).join(" · ");
-  say(find("counts"), connected ? text || "No runs yet" : "The board’s server has stopped.");
-  document.title = counts[0][1] ? `${counts[0][1]} running · qfolio` : "qfolio board";
+  const counts = STATES.map((state) => [state, [...shown].filter((run) => run.state === state).length]);
+  const text = [...counts, ["being read", reading]].filter(([, n]) => n).map(([state, n]) => `${n} ${state}`);
+  if (shown.size < sorted.length) text.unshift(`${shown.size} of ${plural(sorted.length, "run")}`);
+  if (searched) text.push(`only the nearest ${plural(searched, "folder")} are searched`);
+  say(find("counts"), connected ? text.join(" · ") || "No runs yet" : "The board’s server has stopped.");
+  find("unmatched").hidden = shown.size > 0 || !sorted.length;
+  const running = sorted.filter((run) => run.state === "running").length;
+  document.title = running ? `${running} running · qfolio` : "qfolio board";
   find("none").hidden = sorted.length + reading > 0;
   if (following && sorted.length && chosen[0] !== sorted[0].key) {
     chosen = [sorted[0].key];
@@ -159,31 +178,43 @@ function choose(keys) {
 
 // What is chosen ------------------------------------------------------------------------------
 
-function agentOf(run, job) { // of runs in which an agent has many jobs
+function agentOf(run, job) { // of runs in which an agent has many jobs, folds and tables
   const parts = job.name.split("/");
   return run.kind === "backtest" ? parts[0] : run.kind === "study" ? parts.at(-2) : null;
 }
 
-function groups() {
-  const found = [];
+function called(run, job) { // a search names the job of both by the first and the last
+  const both = run.kind === "search" && job.name === "best to preset";
+  return both ? "best and preset, trained afresh" : job.name;
+}
+
+const apart = (run) => run.kind === "run" || run.kind === "comparison"; // whose seeds may be jobs
+
+function nameOf(run, job) { // of the group of jobs that are drawn alike
+  if (apart(run)) return job.name.replace(/\/\d+$/, "");
+  return agentOf(run, job) ?? called(run, job);
+}
+
+function groups() { // a run has one color among several; alone, each of its groups has one
+  const found = [], used = {};
   for (const key of chosen) {
     const run = runs.get(key), detail = details.get(key);
     if (!run || !detail) continue;
     const byName = new Map();
     for (const job of detail.jobs.values()) {
-      const name = agentOf(run, job) ?? job.name;
+      const name = nameOf(run, job);
       if (!byName.has(name)) byName.set(name, []);
       byName.get(name).push(job);
     }
     for (const [name, jobs] of byName) {
-      const labels = [chosen.length > 1 ? run.name : "", name || (chosen.length > 1 ? "" : run.agents.map(tail).join(", "))];
-      found.push({ run, name, jobs, agent: agentOf(run, jobs[0]) ?? "", label: labels.filter(Boolean).join(" · ") });
+      const label = chosen.length === 1 ? name || run.agents.map(tail).join(", ")
+        : byName.size === 1 ? run.name : [run.name, name].filter(Boolean).join(" · ");
+      const color = (chosen.length === 1 ? found.length : chosen.indexOf(key)) % COLORS + 1;
+      const nth = used[color] = (used[color] ?? -1) + 1; // of those in its color: a dash, and dots
+      found.push({ run, name, jobs, agent: agentOf(run, jobs[0]) ?? "", label, color: `var(--agent-${color})`,
+        dash: nth ? "7 4" + " .5 4".repeat(nth - 1) : "" });
     }
   }
-  found.forEach((group, i) => {
-    group.color = `var(--agent-${i % COLORS + 1})`;
-    group.dash = ["", "5 3", "1.5 2.5"][Math.floor(i / COLORS) % 3];
-  });
   return found;
 }
 
@@ -216,7 +247,9 @@ function header(shown, single) {
     const detail = details.get(single.key);
     const left = detail ? remaining(single, detail) : null;
     const text = { running: "Running", done: "Done", stopped: "Stopped", failed: "Failed" }[single.state];
-    const also = single.error ? `: ${single.error}` : single.state === "running" ? "." : ` ${ago(single.last)}.`;
+    const when = single.state === "running" ? "" : ago(single.last);
+    const also = single.error ? `: ${single.error}` : single.last === null ? ". Its log says nothing that can be read."
+      : `${when && " "}${when}.`;
     const words = [element("span", { textContent: text + also, className: single.error ? "bad" : "" })];
     if (single.report) {
       words.push(" ", element("a", { textContent: "Open the report", target: "_blank", rel: "noopener",
@@ -225,7 +258,8 @@ function header(shown, single) {
     const said = [single.key, text, also, single.report].join(" ");
     if (lede.dataset.said !== said) lede.replaceChildren(...words);
     lede.dataset.said = said;
-    facts.push(["done", percent(single.share)], [done ? "took" : "so far", span(until - begun - single.paused)]);
+    if (single.share !== null) facts.push(["done", percent(single.share)]);
+    if (begun !== null) facts.push([done ? "took" : "so far", span(until - begun - single.paused)]);
     if (single.state === "running") facts.push(["left", span(left)], ["steps a second", single.rate ? number(Math.round(single.rate)) : "–"]);
     if (single.seeds) facts.push(["seeds", String(single.seeds)]);
     if (jobs > 1) facts.push(["jobs", `${single.jobs.done || 0} of ${jobs}`]);
@@ -265,7 +299,7 @@ function matrix(single, found) {
       const cell = cells.children[j] || cells.appendChild(element("div", { className: "cell" }, element("i")));
       const state = stateOf(single, job);
       cell.className = `cell ${state}`;
-      cell.title = [job.name, state, state === "running" ? percent(job.share) : "", job.worker].filter(Boolean).join(" · ");
+      cell.title = [called(single, job), state, state === "running" ? percent(job.share) : "", job.worker].filter(Boolean).join(" · ");
       cell.firstChild.style.transform = `scaleY(${job.share})`;
     });
   });
@@ -278,14 +312,14 @@ function stroke(node, group) {
 }
 
 function legend(found) {
-  const text = found.map((group) => group.label + group.color).join("\n");
+  const text = found.map((group) => group.label + group.color + group.dash).join("\n");
   const place = find("legend");
   place.hidden = found.length < 2 && chosen.length < 2;
   if (place.dataset.said === text) return;
   place.dataset.said = text;
   place.replaceChildren(...found.map((group) => {
-    const mark = drawn("svg", { viewBox: "0 0 24 8" });
-    mark.append(stroke(drawn("path", { d: "M1,4H23", "stroke-width": 2.4 }), group));
+    const mark = drawn("svg", { viewBox: "0 0 36 8" });
+    mark.append(stroke(drawn("path", { d: "M1,4H35", "stroke-width": 2.4 }), group));
     return element("li", {}, mark, element("span", { textContent: group.label }));
   }));
 }
@@ -295,7 +329,7 @@ function workers(shown) {
   for (const run of shown) {
     for (const job of details.get(run.key)?.jobs.values() || []) {
       if (stateOf(run, job) === "running" && job.worker) {
-        rows.push([job.worker, job.name, job.rate === null ? "–" : number(Math.round(job.rate)), percent(job.share), span(job.left)]);
+        rows.push([job.worker, called(run, job), job.rate === null ? "–" : number(Math.round(job.rate)), percent(job.share), span(job.left)]);
       }
     }
   }
@@ -312,9 +346,12 @@ function results(shown) {
       rows.push([shown.length > 1 ? `${run.name} · ${name}` : name, values]);
     }
   }
-  find("results").hidden = !rows.length;
+  const pooled = Boolean(!rows.length && shown.length === 1 && shown[0].kind === "study" && shown[0].report);
+  find("results").hidden = !rows.length && !pooled;
+  find("pooled").hidden = !pooled;
+  find("results").querySelector(".scroll").hidden = pooled;
   table(find("results-head"), [["", ...columns.map((key) => key.replaceAll("_", " "))]], "th");
-  table(find("results-rows"), rows.map(([name, values]) => [name, ...columns.map((key) => number(values[key]))]), "td");
+  table(find("results-rows"), rows.map(([name, values]) => [name, ...columns.map((key) => result(key, values[key]))]), "td");
 }
 
 function table(body, rows, kind) {
@@ -327,7 +364,35 @@ function table(body, rows, kind) {
 
 // Curves --------------------------------------------------------------------------------------
 
-const LEFT = 46, RIGHT = 6, TOP = 12, BOTTOM = 22, HEIGHT = 208;
+const LEFT = 46, RIGHT = 8, TOP = 12, BOTTOM = 22, HEIGHT = 208;
+const pen = document.createElement("canvas").getContext("2d"); // measures labels
+
+function linesOf(group, name) {
+  const jobs = group.jobs.filter((job) => Object.hasOwn(job.curves, name) && job.curves[name].length);
+  const lines = jobs.map((job) => ({
+    group, job, points: job.curves[name], alone: group.jobs.length === 1,
+    band: group.jobs.length === 1 && job.members > 1, now: stateOf(group.run, job) === "running",
+  }));
+  if (!apart(group.run) || lines.length < 2) return lines;
+  return [{ group, points: together(jobs, name), alone: true, band: true, now: lines.some((one) => one.now) }];
+}
+
+function together(jobs, name) { // the curve of seeds that are trained apart, at the steps of the furthest
+  const curves = jobs.map((job) => job.curves[name]);
+  const furthest = curves.reduce((a, b) => (b.at(-1)[0] > a.at(-1)[0] ? b : a));
+  return furthest.map(([step]) => {
+    const there = curves.filter((points, i) => jobs[i].state === "done" || points.at(-1)[0] >= step)
+      .map((points) => between(points, step));
+    return [step, there.reduce((sum, p) => sum + p[1], 0) / there.length,
+      Math.min(...there.map((p) => p[2])), Math.max(...there.map((p) => p[3]))];
+  });
+}
+
+function between(points, step) { // on the straight line between two points; the last one goes on
+  const [before, after] = around(points, step);
+  const share = Math.max(0, Math.min(1, (step - before[0]) / (after[0] - before[0] || 1)));
+  return before.map((v, k) => v + share * (after[k] - v));
+}
 
 function charts(found) { // agents of a backtest differ in losses and steps: each has its own charts
   const agents = [...new Set(found.map((group) => group.agent))], wanted = new Map();
@@ -364,29 +429,31 @@ function plot(chart, name, found, of) {
   say(chart.querySelector("h3 span"), title);
   svg.setAttribute("viewBox", `0 0 ${width} ${HEIGHT}`);
   svg.setAttribute("aria-label", title);
-  const lines = found.flatMap((group) => group.jobs.filter((job) => Object.hasOwn(job.curves, name) && job.curves[name].length).map((job) => ({
-    group, job, points: job.curves[name], alone: group.jobs.length === 1,
-    now: stateOf(group.run, job) === "running",
-  })));
+  const lines = found.flatMap((group) => linesOf(group, name));
   const points = lines.flatMap((one) => one.points);
   const steps = extent([0, ...points.map((p) => p[0])]), values = range(points.map((p) => p[1]));
-  const x = (v) => LEFT + (width - LEFT - RIGHT) * (v - steps[0]) / (steps[1] - steps[0] || 1);
+  const across = ticks(steps, width > 420 ? 5 : 4), up = ticks(values, 4), said = labels(up);
+  pen.font = `11px ${getComputedStyle(svg).fontFamily}`;
+  const wide = (text) => pen.measureText(text).width;
+  const left = Math.max(LEFT, ...said.map((text) => wide(text) + 8));
+  const x = (v) => left + (width - left - RIGHT) * (v - steps[0]) / (steps[1] - steps[0] || 1);
   const y = (v) => HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * (Math.max(values[0], Math.min(values[1], v)) - values[0]) / (values[1] - values[0]);
   const parts = [];
-  for (const tick of ticks(values, 4)) {
-    parts.push(drawn("line", { class: "grid", x1: LEFT, x2: width - RIGHT, y1: y(tick), y2: y(tick) }));
-    const text = drawn("text", { x: LEFT - 8, y: y(tick) + 4, "text-anchor": "end" });
-    text.textContent = short(tick);
+  for (const [i, tick] of up.entries()) {
+    parts.push(drawn("line", { class: "grid", x1: left, x2: width - RIGHT, y1: y(tick), y2: y(tick) }));
+    const text = drawn("text", { x: left - 8, y: y(tick) + 4, "text-anchor": "end" });
+    text.textContent = said[i];
     parts.push(text);
   }
-  for (const tick of ticks(steps, width > 420 ? 5 : 4)) {
-    const text = drawn("text", { x: x(tick), y: HEIGHT - 4, "text-anchor": x(tick) > width - 30 ? "end" : x(tick) < LEFT + 12 ? "start" : "middle" });
-    text.textContent = short(tick);
+  for (const [i, label] of labels(across).entries()) {
+    if (x(across[i]) + wide(label) / 2 > width + RIGHT) continue; // would hang out
+    const text = drawn("text", { x: x(across[i]), y: HEIGHT - 4, "text-anchor": "middle" });
+    text.textContent = label;
     parts.push(text);
   }
   for (const one of lines) {
     const at = (k) => one.points.map((p) => `${x(p[0]).toFixed(1)},${y(p[k]).toFixed(1)}`);
-    if (one.alone && one.job.members > 1 && one.points.length > 1) {
+    if (one.band && one.points.length > 1) {
       const band = drawn("path", { class: "band", d: `M${at(3).join("L")}L${at(2).reverse().join("L")}Z` });
       band.style.fill = one.group.color;
       parts.push(band);
@@ -399,15 +466,15 @@ function plot(chart, name, found, of) {
   }
   const last = lines.filter((one) => one.alone);
   say(chart.querySelector("output"), last.length === 1 ? number(last[0].points.at(-1)[1]) : "");
-  tip(chart, lines, steps, width, parts, x);
+  tip(chart, lines, steps, left, width, parts, x);
   svg.replaceChildren(...parts);
 }
 
-function tip(chart, lines, steps, width, parts, x) {
+function tip(chart, lines, steps, left, width, parts, x) {
   const place = chart.querySelector(".tip");
   place.hidden = hovered?.id !== chart.dataset.id || !lines.length;
   if (place.hidden) return;
-  const step = steps[0] + (steps[1] - steps[0]) * Math.max(0, Math.min(1, (hovered.x - LEFT) / (width - LEFT - RIGHT)));
+  const step = steps[0] + (steps[1] - steps[0]) * Math.max(0, Math.min(1, (hovered.x - left) / (width - left - RIGHT)));
   parts.push(drawn("line", { class: "cursor", x1: x(step), x2: x(step), y1: TOP, y2: HEIGHT - BOTTOM }));
   place.classList.toggle("left", hovered.x > width / 2);
   const near = lines.map((one) => ({ one, point: nearest(one.points, step) }));
@@ -421,13 +488,18 @@ function tip(chart, lines, steps, width, parts, x) {
     }), ...(near.length > 8 ? [element("div", { textContent: `and ${near.length - 8} more` })] : []));
 }
 
-function nearest(points, step) {
+function around(points, step) { // the points before and after a step
   let low = 0, high = points.length - 1;
   while (high - low > 1) {
     const middle = (low + high) >> 1;
     if (points[middle][0] < step) low = middle; else high = middle;
   }
-  return step - points[low][0] < points[high][0] - step ? points[low] : points[high];
+  return [points[low], points[high]];
+}
+
+function nearest(points, step) {
+  const [before, after] = around(points, step);
+  return step - before[0] < after[0] - step ? before : after;
 }
 
 function extent(values) {
@@ -471,7 +543,7 @@ async function look() {
     chosen = []; following = true;
     return;
   }
-  ({ version, reading } = news);
+  ({ version, reading, searched } = news);
   say(find("root"), news.root);
   for (const run of news.runs) { runs.set(run.key, run); item(run); }
   const keys = new Set(news.keys);

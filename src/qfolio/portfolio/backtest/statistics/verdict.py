@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from qfolio.core.text import listed
+from qfolio.core.text import figure, listed
 from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment, StrategyAssessment
 from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
 from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference, Finding
@@ -48,8 +48,7 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
     if rebalanced is None:
         main, at_any, at_best = alone, reference, reference
     else:
-        main, at_any = rebalanced, f"{reference}, however it is rebalanced,"
-        at_best = f"the best rebalancing of {reference}"
+        main, at_any, at_best = rebalanced, at_any_speed(reference), at_best_speed(reference)
     if wiped_out(entry) or main.growth.value == math.inf:
         return [(_ruin(name, entry, main), main)]
     claim = _claim(name, main, at_any, at_best)
@@ -69,6 +68,16 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
         if each is not None:
             said.append((_claim(name, each, each.reference, each.reference), each))
     return [(claim, difference) for claim, difference in said if claim]
+
+
+def at_any_speed(reference: str) -> str:
+    """The reference and all of its rebalancings, in words."""
+    return f"{reference}, however it is rebalanced,"
+
+
+def at_best_speed(reference: str) -> str:
+    """The rebalancing of the reference that grew most, in words."""
+    return f"the best rebalancing of {reference}"
 
 
 def wiped_out(strategy: StrategyAssessment) -> bool:
@@ -249,9 +258,4 @@ def bound_sentence(assessment: Assessment) -> str:
 
 
 def _number(value: float, digits: int, sign: bool = False) -> str:
-    if math.isnan(value):
-        return "undefined"
-    text = "∞" if math.isinf(value) else f"{abs(value):.{digits}f}"
-    if not text.strip("0."):
-        return text
-    return ("\N{MINUS SIGN}" if value < 0 else "+" if sign else "") + text
+    return "undefined" if math.isnan(value) else figure(value, f"{'+' if sign else ''}.{digits}f")

@@ -3,7 +3,7 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import Preset, preset
-from qfolio.portfolio.short import fitted
+from qfolio.portfolio.few_rows import fitted
 from qfolio.portfolio.task import Portfolio
 
 from tables import price_table, random_walk

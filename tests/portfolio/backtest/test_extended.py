@@ -11,7 +11,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.prices.growth import require_grown
+from qfolio.portfolio.prices.extended import require_grown
 
 from populations import assert_same
 from tables import price_table, random_walk

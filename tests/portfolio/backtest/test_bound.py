@@ -1,13 +1,11 @@
 """The bound on constant weights: it is reached, and it is not exceeded."""
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest import hindsight
-from qfolio.portfolio.backtest.hindsight import constant_bound
+from qfolio.portfolio.backtest.bound import constant_bound
 from qfolio.portfolio.backtest.simulation import simulate
 
 from tables import random_walk
@@ -46,6 +44,5 @@ def test_a_bound_beyond_all_floats_is_infinite() -> None:
 
 
 def test_without_a_certificate_there_is_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    strict = partial(hindsight.growth_optimal, tol=-1.0)
-    monkeypatch.setattr(hindsight, "growth_optimal", strict)
+    monkeypatch.setattr("qfolio.solvers.merton.TOLERANCE", -1.0)
     assert constant_bound(np.ones((4, 3)), 252) is None

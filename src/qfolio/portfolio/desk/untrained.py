@@ -18,6 +18,7 @@ from qfolio.portfolio.backtest.orders import TOLERANCE, ask, holdable, obeying
 from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.mandate import checks
+from qfolio.portfolio.mandate.feasible import TURNOVER_OF_YEAR
 from qfolio.portfolio.mandate.limits import feasible, largest_weight
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.frequency import require_alike
@@ -172,7 +173,7 @@ class Ordered(Untrained):
                 left = self.task.terms.unspent(self.task.terms.begin(held, spent))
                 if left is not None:
                     change = abs(target - held)[1:].sum()
-                    found["turnover of the year is too high by"] = change - left
+                    found[TURNOVER_OF_YEAR] = change - left
             broken = [f"{what} {by:.2g}" for what, by in found.items() if by > TOLERANCE]
             if broken:
                 said.append(

@@ -12,8 +12,8 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.follow import follow
-from qfolio.portfolio.desk.rule import Ordered, Rule
 from qfolio.portfolio.desk.standing import Standing
+from qfolio.portfolio.desk.untrained import Ordered, Rule
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 

@@ -1,0 +1,19 @@
+"""What is said of errors that a user can fix."""
+
+from importlib import import_module
+
+import pytest
+
+from qfolio.core.errors import QfolioError, needs
+
+
+def test_only_a_package_that_is_missing_is_said_to_be_missing(monkeypatch, tmp_path):
+    """One that is there, but lacks a package of its own, is not to be installed again."""
+    (tmp_path / "half_there.py").write_text("import not_there")
+    monkeypatch.syspath_prepend(tmp_path)
+    hint = "pip install 'qfolio[this]'."
+    with pytest.raises(QfolioError) as raised, needs("not_there", otherwise=hint):
+        import_module("not_there")
+    assert str(raised.value) == hint
+    with pytest.raises(ModuleNotFoundError, match="not_there"), needs("half_there", otherwise=hint):
+        import_module("half_there")
