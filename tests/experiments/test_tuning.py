@@ -16,6 +16,7 @@ import pytest
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.agents.sac import SAC
+from qfolio.commands.console.tuning import describe_search
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
@@ -301,6 +302,17 @@ def test_the_log_tells_fresh_seeds_from_those_of_the_search(tmp_path, task, agen
     count = len(logged())
     assert work.conclude() == summary
     assert len(logged()) == count
+
+
+def test_a_preset_outside_the_ranges_is_no_trial_and_that_is_said(tmp_path, task, agent):
+    assert len(describe_search(start(tmp_path / "in", task, agent))) == 3
+    endless = dataclasses.replace(agent, huber_delta=math.inf)
+    out = start(tmp_path / "out", task, endless, "huber_delta=0.1..10")
+    assert describe_search(out)[-1] == (
+        "The preset is no trial, because it has huber_delta=inf; it is graded at the end."
+    )
+    out.run()
+    assert not any(trial.is_preset for trial in out.journal.trials())
 
 
 def test_a_search_where_all_diverge_says_so(tmp_path, task, agent):

@@ -85,7 +85,7 @@ def continual(
 
     following = trackers(track)
     if resume is None:
-        task, preset = task or "pendulum", preset or "fast"
+        task, preset = task or "pendulum", "fast" if preset is None else preset
         agent = agent or presets.default_agent(task)
         shares = {"rate": rate, "renewal": renewal, "epsilon": epsilon}
         options: dict[str, Any] = {k: x for k, x in shares.items() if x is not None}

@@ -109,7 +109,7 @@ def train(
         _require_seen(task)
     with _window(live) as show:
         if resume is None:
-            task, preset = task or "pendulum", preset or "fast"
+            task, preset = task or "pendulum", "fast" if preset is None else preset
             agent = agent or presets.default_agent(task)
             folder = out or new_folder(task, registry.short(agent), preset)
             chosen = settings.parse(assignments)

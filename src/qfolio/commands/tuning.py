@@ -96,10 +96,9 @@ def tune(
     executor, following = executor_of(on), trackers(track)
     budget = budget_of(episodes, steps)
     if join is None:
-        task = task or "pendulum"
+        task, preset = task or "pendulum", "fast" if preset is None else preset
         agent = agent or presets.default_agent(task)
-        work = _new(task, agent, preset or "fast", trials, seeds, budget, batch, search,
-                    assignments, out)  # fmt: skip
+        work = _new(task, agent, preset, trials, seeds, budget, batch, search, assignments, out)
     elif task is not None or not continues("trials", "batch"):
         raise QfolioError(
             "--join keeps the settings of the search; add only --trials, --batch, --on, --track or "

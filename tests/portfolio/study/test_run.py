@@ -7,6 +7,7 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.statistics import holm
+from qfolio.experiments.events import EVENTS, read
 from qfolio.experiments.executor import Here
 from qfolio.portfolio.backtest.folds import require_fold
 from qfolio.portfolio.study.folder import Variant
@@ -103,6 +104,17 @@ def test_a_study_writes_typed_finite_numbers(finished):
     assert main["to_reference"]["p_holm"] is not None
     assert content["result"]["variants"][1]["agents"]["pathwise"]["to_reference"]["p_holm"] is None
     assert "4 of 4 backtests finished" in repr(finished)
+
+
+def test_the_log_of_a_study_has_its_result(finished):
+    events, _ = read(finished.folder / EVENTS)
+    pooled = finished.config.result.variants[0].agents["pathwise"].to_reference
+    (values,) = [event["values"] for event in events if event["event"] == "result"]
+    assert values == {
+        "pathwise": {
+            "active_growth": pooled.growth, "low": pooled.low, "high": pooled.high, "z": pooled.z,
+        }
+    }  # fmt: skip
 
 
 def test_a_study_shows_itself_in_a_notebook(finished, tmp_path):

@@ -458,18 +458,6 @@ def test_labels_of_an_axis_stay_in_its_column_and_are_spaced_evenly(
     assert max(gaps) - min(gaps) < 1
 
 
-def test_the_best_and_the_preset_of_a_search_are_named_so(
-    board: Board, browser: Browser, tmp_path: Path
-) -> None:
-    jobs = [*curve("trial 1 to trial 3", 1.0), *curve("best to preset", 2.0)]
-    finished(tmp_path / "runs" / "search", "search", ["dqn"], *jobs)
-    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 2")
-    for place in ("legend", "matrix"):
-        said = browser.evaluate(f"document.getElementById('{place}').innerText")
-        assert "trial 1 to trial 3" in said
-        assert "best and preset, trained afresh" in said
-
-
 @pytest.mark.parametrize("content", ["", "no log"])
 def test_a_log_that_says_nothing_has_no_time(
     board: Board, browser: Browser, tmp_path: Path, content: str

@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qfolio.commands.console import say, tell
-from qfolio.core.text import amount, figure
+from qfolio.core.settings import written
+from qfolio.core.text import amount, figure, listed
+from qfolio.experiments.tuning.search import own_value
 from qfolio.report.words import agent_name
 
 if TYPE_CHECKING:
@@ -16,11 +18,20 @@ def describe_search(work: "Tuning") -> list[str]:
     """A line with what a search trains, and one with the range and scale of each setting."""
     config, budget = work.config, work.config.budget
     seeds = amount(config.seeds, "seed")
-    return [
+    outside = [
+        f"{dim.name}={written(value)}"
+        for dim in work.space
+        if not dim.covers(value := own_value(work.agent, dim))
+    ]
+    lines = [
         f"{agent_name(config.agent)} on {config.task} · preset {config.preset} · "
         f"{config.trials} trials × {seeds} · {budget.amount:,} {budget.unit} · {config.device}",
         *(f"  {dim.name:<20} {dim}  ({dim.scale})" for dim in work.space),
     ]
+    if outside:
+        has = listed(outside)
+        lines.append(f"The preset is no trial, because it has {has}; it is graded at the end.")
+    return lines
 
 
 def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:

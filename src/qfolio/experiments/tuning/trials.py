@@ -39,7 +39,9 @@ class TrialsJob:
     @property
     def name(self) -> str:
         first, *others = self.names
-        return f"{first} to {others[-1]}" if others else first
+        if len(others) > 1:
+            return f"{first} to {others[-1]}"
+        return " and ".join(self.names)  # such as the best and the preset
 
     @property
     def members(self) -> list[str]:

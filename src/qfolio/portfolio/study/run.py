@@ -32,7 +32,7 @@ from qfolio.core.registry import again
 from qfolio.core.text import amount, near
 from qfolio.experiments.executor import Executor
 from qfolio.experiments.interrupts import interruptible
-from qfolio.experiments.log import Log
+from qfolio.experiments.log import Log, add_result
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.attribution.explain import explain
@@ -321,6 +321,7 @@ class Study:
         self.config = msgspec.structs.replace(config, result=result)
         self._files.write(self.config)
         self._files.write_table(result)
+        add_result(self.folder, _measures(result))
         return result
 
     @property
@@ -349,6 +350,15 @@ def _table_config(prices: Prices, trials: int) -> TableConfig:
     facts = describe(prices)
     kept = {key: facts[key] for key in ("source", "digest", "rows", "assets", "first", "last")}
     return TableConfig(**kept, note=str(facts["note"] or ""), trials=trials)
+
+
+def _measures(result: Result) -> dict[str, dict[str, float | None]]:
+    """What the log says of each agent: its active growth a year in the main variant, and z."""
+    found = {name: pools.to_reference for name, pools in result.variants[0].agents.items()}
+    return {
+        name: {"active_growth": one.growth, "low": one.low, "high": one.high, "z": one.z}
+        for name, one in found.items()
+    }
 
 
 def _count(looks: Sequence[Look], digest: str) -> int:

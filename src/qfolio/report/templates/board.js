@@ -4,7 +4,7 @@
 
 const EVERY = 700; // milliseconds between two questions
 const COLORS = 6; // then they come again, dashed
-const SHARES = ["growth", "volatility", "drawdown", "cost_drag", "regret"]; // results in percent
+const SHARES = ["growth", "active_growth", "low", "high", "volatility", "drawdown", "cost_drag", "regret"]; // results in percent
 const STATES = ["running", "done", "stopped", "failed"];
 const NAMES = { // what curves show, the most telling first
   "return": "Return in training", "greedy return": "Greedy return", "greedy regret": "Greedy regret",
@@ -183,16 +183,11 @@ function agentOf(run, job) { // of runs in which an agent has many jobs, folds a
   return run.kind === "backtest" ? parts[0] : run.kind === "study" ? parts.at(-2) : null;
 }
 
-function called(run, job) { // a search names the job of both by the first and the last
-  const both = run.kind === "search" && job.name === "best to preset";
-  return both ? "best and preset, trained afresh" : job.name;
-}
-
 const apart = (run) => run.kind === "run" || run.kind === "comparison"; // whose seeds may be jobs
 
 function nameOf(run, job) { // of the group of jobs that are drawn alike
   if (apart(run)) return job.name.replace(/\/\d+$/, "");
-  return agentOf(run, job) ?? called(run, job);
+  return agentOf(run, job) ?? job.name;
 }
 
 function groups() { // a run has one color among several; alone, each of its groups has one
@@ -299,7 +294,7 @@ function matrix(single, found) {
       const cell = cells.children[j] || cells.appendChild(element("div", { className: "cell" }, element("i")));
       const state = stateOf(single, job);
       cell.className = `cell ${state}`;
-      cell.title = [called(single, job), state, state === "running" ? percent(job.share) : "", job.worker].filter(Boolean).join(" · ");
+      cell.title = [job.name, state, state === "running" ? percent(job.share) : "", job.worker].filter(Boolean).join(" · ");
       cell.firstChild.style.transform = `scaleY(${job.share})`;
     });
   });
@@ -329,7 +324,7 @@ function workers(shown) {
   for (const run of shown) {
     for (const job of details.get(run.key)?.jobs.values() || []) {
       if (stateOf(run, job) === "running" && job.worker) {
-        rows.push([job.worker, called(run, job), job.rate === null ? "–" : number(Math.round(job.rate)), percent(job.share), span(job.left)]);
+        rows.push([job.worker, job.name, job.rate === null ? "–" : number(Math.round(job.rate)), percent(job.share), span(job.left)]);
       }
     }
   }
