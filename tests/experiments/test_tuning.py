@@ -462,7 +462,7 @@ def test_jobs_fill_a_worker(tmp_path, task, agent):
     executor, starts = Elsewhere(), np.zeros((4, 2), np.uint32)
     executor.devices = 4
     made = trials_jobs(task, agents, [0, 1], Budget(4), starts, executor)
-    assert [job.name for job in made] == ["0 to 1", "2 to 3", "4", "other"]
+    assert [job.name for job in made] == ["0 and 1", "2 and 3", "4", "other"]
     assert [job.most for job in made] == [2, 2, 2, 1]
     whole = trials_jobs(task, agents, [0, 1], Budget(4), starts, Here())
     assert [job.name for job in whole] == ["0 to 4", "other"]

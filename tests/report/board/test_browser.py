@@ -302,6 +302,13 @@ def curve(job: str, *values: float, of: str = "return", steps: float = 10) -> li
     return [members, *records, {"event": "done", "job": job}]
 
 
+def test_what_was_never_known_has_no_chart(board: Board, browser: Browser, tmp_path: Path) -> None:
+    unknown = {"event": "record", "job": "", "step": 10, "values": {"overestimation": [None]}}
+    finished(tmp_path / "runs" / "a", "run", ["dqn"], unknown, *curve("", 1.0, 2.0))
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 1")
+    assert browser.evaluate("document.querySelectorAll('#charts .chart').length") == 1
+
+
 def test_a_run_has_the_color_of_its_place_in_the_list(
     board: Board, browser: Browser, tmp_path: Path
 ) -> None:

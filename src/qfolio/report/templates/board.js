@@ -395,7 +395,8 @@ function charts(found) { // agents of a backtest differ in losses and steps: eac
   const rank = (name) => (order.includes(name) ? order.indexOf(name) : order.length);
   for (const agent of agents) {
     const groups = found.filter((group) => group.agent === agent);
-    const metrics = new Set(groups.flatMap((group) => group.jobs.flatMap((job) => Object.keys(job.curves))));
+    const known = (job) => Object.keys(job.curves).filter((name) => job.curves[name].length);
+    const metrics = new Set(groups.flatMap((group) => group.jobs.flatMap(known)));
     for (const name of [...metrics].sort((a, b) => rank(a) - rank(b) || (a < b ? -1 : 1))) {
       wanted.set(`${agent}\n${name}`, { name, groups, of: agents.length > 1 ? agent : "" });
     }
