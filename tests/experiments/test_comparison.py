@@ -17,7 +17,7 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.ppo import PPO
 from qfolio.commands.progress import JobsProgress
 from qfolio.core.errors import QfolioError
-from qfolio.core.statistics import interquartile_mean
+from qfolio.core.statistics import interquartile_mean, regret
 from qfolio.core.text import figure
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
@@ -291,6 +291,9 @@ def test_a_comparison_shows_itself_in_a_notebook(finished):
         assert f"<td>{name}</td>" in shown
         middle = float(interquartile_mean(content["results"][name]["returns"]))
         assert figure(middle, ",.4g") in shown
+        missed = regret(middle, content["results"][name]["optimum"])
+        assert missed is not None
+        assert f"<td>{share(float(missed))}</td>" in shown
 
 
 def test_a_comparison_in_its_folder(finished):

@@ -101,6 +101,7 @@ def test_a_run_shows_itself_in_a_notebook(task, agent, tmp_path):
     shown = run._repr_html_()
     assert "preset &lt;b&gt;" in shown
     assert "<svg" in shown
+    assert "greedy return, 64 starts" in shown
     assert figure(run.evaluations[-1]["return"], ",.4g") in shown
 
 

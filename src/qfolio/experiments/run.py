@@ -134,7 +134,7 @@ class Run(Seeds):
                 f"{self.seconds_train:.1f} s of training",
                 *([] if self.folder is None else [str(self.folder)]),
             ],
-            ("seed", "greedy return"),
+            ("seed", f"greedy return, {self.population.curve_starts} starts"),
             [
                 (str(int(row["seed"])), four_digits(row["return"]))
                 for row in self.evaluations[-seeds:]

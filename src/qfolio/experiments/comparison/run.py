@@ -36,7 +36,7 @@ from qfolio.core.statistics import interquartile_mean, regret
 from qfolio.core.text import amount, four_digits, listed
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range, unlearned
-from qfolio.experiments.comparison.conclusion import conclusion
+from qfolio.experiments.comparison.conclusion import conclusion, share
 from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.ranking import Result, rank
 from qfolio.experiments.described import agent_of, describe, task_of
@@ -216,8 +216,10 @@ class Comparison:
         for name in self.entrants:
             known = _measures(self.results[name]) if name in self.results else {}
             seconds = self.results[name].seconds_train if name in self.results else None
-            cells = (known.get("return"), known.get("regret"), seconds)
-            rows.append((name, *map(four_digits, cells), self.failures.get(name, "")))
+            missed = known.get("regret")
+            regret = "–" if missed is None else share(missed)
+            earned = four_digits(known.get("return"))
+            rows.append((name, earned, regret, four_digits(seconds), self.failures.get(name, "")))
         done = f"{len(self.results)} of {len(self.entrants)} agents"
         seeds = amount(config.seeds, "seed")
         header = ("agent", "return", "regret", "seconds", "")
