@@ -15,7 +15,7 @@ import pandas as pd
 
 from qfolio.core.files import read_json
 from qfolio.report import palette
-from qfolio.report.figures.style import LEAD, new_figure, save_png
+from qfolio.report.figures.style import new_figure, save_png
 from qfolio.report.rendering import percent
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "edge.png"
 AGENT = "tilts-together"
+WIDTH = 8.4  # inches
 
 
 class Panel(NamedTuple):
@@ -43,12 +44,12 @@ def panel(title: str, folder: Path) -> Panel:
         for growth in (compared["growth"]["value"], *compared["growth"]["interval"])
     )
     wealth = (1 + returns).cumprod()
-    difference = f"{value} a year\n95% interval {low} to {high}"
+    difference = f"{value} a year\n95%: {low} to {high}"
     return Panel(title, wealth[AGENT], wealth[compared["reference"]], difference)
 
 
 def draw_panels(panels: list[Panel], width: float) -> Figure:
-    figure = new_figure(width, 3.6)
+    figure = new_figure(width, 3.3)
     charts = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, part in zip(charts, panels, strict=True):
         _draw(axes, part)
@@ -92,4 +93,4 @@ def _draw(axes: Axes, part: Panel) -> None:
 
 if __name__ == "__main__":
     parts = [argument.partition("=") for argument in sys.argv[1:]]
-    save_png(PICTURE, draw_panels, [panel(title, Path(at)) for title, _, at in parts], LEAD)
+    save_png(PICTURE, draw_panels, [panel(title, Path(at)) for title, _, at in parts], WIDTH)
