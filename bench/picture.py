@@ -28,12 +28,16 @@ WIDTH = 8.4  # inches
 
 
 class Panel(NamedTuple):
-    """A table's name, the wealth of both on it, and how much faster that of tilts grew."""
+    """A table's name, the wealth of both on it, and how much faster that of tilts grew.
+
+    seeds: those of tilts, which trade together.
+    """
 
     title: str
     tilts: pd.Series
     equal_weight: pd.Series  # at the speed of rebalancing that grew most
     difference: str
+    seeds: int
 
 
 def panel(title: str, folder: Path) -> Panel:
@@ -45,7 +49,8 @@ def panel(title: str, folder: Path) -> Panel:
     )
     wealth = (1 + returns).cumprod()
     difference = f"{value} a year\n95%: {low} to {high}"
-    return Panel(title, wealth[AGENT], wealth[compared["reference"]], difference)
+    seeds = read_json(folder / "config.json")["seeds"]
+    return Panel(title, wealth[AGENT], wealth[compared["reference"]], difference, seeds)
 
 
 def draw_panels(panels: list[Panel], width: float) -> Figure:
@@ -76,7 +81,9 @@ def _draw(axes: Axes, part: Panel) -> None:
         days, part.equal_weight, color=palette.INK, linewidth=1.0,
         label="equal weight at its best speed of rebalancing",
     )  # fmt: skip
-    axes.plot(days, part.tilts, color=palette.ACCENT, linewidth=1.4, label="tilts, five seeds")
+    axes.plot(
+        days, part.tilts, color=palette.ACCENT, linewidth=1.4, label=f"tilts, {part.seeds} seeds"
+    )
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=9))
     axes.yaxis.set_major_formatter(lambda tick, _: f"{tick:g}")

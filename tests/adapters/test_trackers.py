@@ -1,5 +1,6 @@
 """Trackers: TensorBoard itself, and stand-ins for the two that have init, log and finish."""
 
+import json
 import os
 import sys
 import types
@@ -209,6 +210,20 @@ def test_a_tracker_of_ones_own_on_the_command_line(own, monkeypatch, tmp_path):
     assert first == "pendulum dqn"
     assert any("'return'" in line for line in rest)
     assert any("'greedy return'" in line for line in rest)
+
+
+@pytest.mark.slow
+def test_a_tracker_that_prints_does_not_break_the_document(own, monkeypatch, capsys):
+    Path("talking.py").write_text(
+        "import qfolio\nclass Loud(qfolio.Tracker):\n    def finish(self):\n        print('bye')\n"
+    )
+    words = ["train", "--episodes", 8, "--no-compare", "--out", "run", *TINY, "--json"]
+    assert qfolio(monkeypatch, *words, "--track", "talking:Loud") == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["agent"] == "dqn"
+    assert "bye" in err
+    events, _ = read(Path("run/events.jsonl"))
+    assert [event["event"] for event in events[-2:]] == ["result", "end"]
 
 
 @pytest.mark.parametrize(

@@ -113,8 +113,8 @@ def test_lags_and_costs_are_lists_beside_the_main_value():
 
 
 def test_tables_are_called_as_their_files_in_any_script():
-    files = ("bo\u0308rse.csv", "株価.csv", "指数=index.csv", "S&P 500.csv")
-    assert list(_tables(files, str)) == ["b\u00f6rse", "株価", "指数", "S-P-500"]
+    files = ("bo\u0308rse.csv", "株価.csv", "指数=index.csv", "u\u0308=eu.csv", "S&P 500.csv")
+    assert list(_tables(files, str)) == ["b\u00f6rse", "株価", "指数", "\u00fc", "S-P-500"]
 
 
 def test_a_folder_has_one_configuration(place, monkeypatch, capsys):

@@ -323,16 +323,18 @@ def test_a_policy_acts_in_the_environment_as_it_is_graded(kind):
                 seen, reward, terminated, truncated, _ = env.step(policy(seen))
                 over, earned = terminated or truncated, earned + reward
             assert earned == pytest.approx(graded[member, start], rel=1e-5)
-    with pytest.raises(QfolioError, match="seed is 5; the run has 3 to 4"):
+    with pytest.raises(QfolioError, match="seed is 5; the first of this run is 3, and the last 4"):
         run.policy(5)
     if kind is Aim:
-        with pytest.raises(QfolioError, match=r"shape \(3,\); gym:TestAim-v0 has \(2,\)"):
+        with pytest.raises(QfolioError, match=r"shape \(3,\); that of gym:TestAim-v0 is \(2,\)"):
             run.policy()(np.zeros(3))
 
 
 def test_a_policy_keeps_what_it_was_made_with():
     run = train(Pendulum(horizon=20), DQN(hidden=(8,), learning_starts=10), episodes=2)
     policy, seen = run.policy(), np.array([1.0, 0.0, 0.5])
+    with pytest.raises(QfolioError, match=r"shape \(4, 3\); that of pendulum is \(3,\)"):
+        policy(np.zeros((4, 3)))  # a batch
     weights = run.first_weights()
     values = run.agent.action_values(weights, seen[None].astype(np.float32))
     assert values is not None

@@ -18,7 +18,7 @@ from qfolio.agents.ppo import PPO
 from qfolio.commands.progress import JobsProgress
 from qfolio.core.errors import QfolioError
 from qfolio.core.statistics import interquartile_mean, regret
-from qfolio.core.text import figure
+from qfolio.core.text import four_digits
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
 from qfolio.experiments.comparison.conclusion import conclusion, share
@@ -290,7 +290,7 @@ def test_a_comparison_shows_itself_in_a_notebook(finished):
     for name in ("slow", "quick"):
         assert f"<td>{name}</td>" in shown
         middle = float(interquartile_mean(content["results"][name]["returns"]))
-        assert figure(middle, ",.4g") in shown
+        assert f"<td>{four_digits(middle)}</td>" in shown
         missed = regret(middle, content["results"][name]["optimum"])
         assert missed is not None
         assert f"<td>{share(float(missed))}</td>" in shown

@@ -1,5 +1,6 @@
 """The log of an experiment: what it says, and that nothing counts twice."""
 
+import contextlib
 import errno
 import os
 from time import process_time
@@ -252,6 +253,10 @@ def test_grades_are_a_part_of_work_that_lasts(tmp_path):
     assert [event["event"] for event in logged(tmp_path / "a")] == [
         "start", "record", "result", "end",
     ]  # fmt: skip
+    (tmp_path / "d").mkdir()
+    with lasting(), contextlib.suppress(QfolioError), Log(tmp_path / "d").opened(kind="run"):
+        raise QfolioError("not finite")  # which the block around does without
+    assert logged(tmp_path / "d")[-1]["state"] == "failed"
     (tmp_path / "c").mkdir()
     with pytest.raises(ValueError, match="of grading"), lasting():  # noqa: PT012
         with Log(tmp_path / "c").opened(kind="run") as log:

@@ -19,7 +19,7 @@ from qfolio.agents.pathwise import Pathwise
 from qfolio.agents.tabular import QLearning
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import write_arrays
-from qfolio.core.text import figure
+from qfolio.core.text import four_digits
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.ar1 import Ar1
@@ -102,7 +102,7 @@ def test_a_run_shows_itself_in_a_notebook(task, agent, tmp_path):
     assert "preset &lt;b&gt;" in shown
     assert "<svg" in shown
     assert "greedy return, 64 starts" in shown
-    assert figure(run.evaluations[-1]["return"], ",.4g") in shown
+    assert f"<td>{four_digits(run.evaluations[-1]['return'])}</td>" in shown
 
 
 def test_steps_say_how_far_as_episodes_do(task, agent, tmp_path):

@@ -309,7 +309,8 @@ def test_a_preset_outside_the_ranges_is_no_trial_and_that_is_said(tmp_path, task
     endless = dataclasses.replace(agent, huber_delta=math.inf)
     out = start(tmp_path / "out", task, endless, "huber_delta=0.1..10")
     assert describe_search(out)[-1] == (
-        "The preset is no trial, because it has huber_delta=inf; it is graded at the end."
+        "The preset is no trial, because it has huber_delta=inf, which is outside 0.1..10.0; it is "
+        "graded at the end."
     )
     out.run()
     assert not any(trial.is_preset for trial in out.journal.trials())

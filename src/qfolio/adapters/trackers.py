@@ -35,6 +35,10 @@ class TensorBoard(Tracker):
         for name, value in values.items():
             self._writer.add_scalar(name, value, step)
 
+    def event(self, event: Mapping[str, Any]) -> None:
+        if event["event"] in ("done", "stopped", "failed"):  # Ctrl-C may end what follows
+            self._writer.flush()
+
     def finish(self) -> None:
         self._writer.close()
 

@@ -108,8 +108,7 @@ def grouped(command: Callable[..., Any]) -> Callable[..., None]:
         for name, kind in kinds.items():
             own = [field.name for field in dataclasses.fields(kind)]
             given[name] = kind(**{option: given.pop(option) for option in own})
-        with lasting():
-            _report(command, given, as_json)
+        _report(command, given, as_json)
 
     call: Any = configure(OmitArgPrefixes)(lambda **given: run(given))
     call.__name__, call.__doc__ = command.__name__, command.__doc__
@@ -194,12 +193,14 @@ def outcome(folder: Path, content: Document) -> Document:
 def _report(command: Callable[..., Any], given: dict[str, Any], as_json: bool) -> None:
     """Runs a command; with ``as_json``, prints only its document to the standard output."""
     if not as_json:
-        command(**given)
+        with lasting():
+            command(**given)
         return
     failed = None
     with contextlib.redirect_stdout(sys.stderr):
         try:
-            document = command(**given)
+            with lasting():
+                document = command(**given)
         except Failed as failure:
             failed, document = failure, failure.document
     print(json.dumps(finite(document), indent=2, allow_nan=False, default=str))

@@ -106,10 +106,12 @@ def _tables(sets: tuple[str, ...], load: Any) -> "dict[str, Prices]":
     """The tables by name, in the order of the command line."""
     files: dict[str, Path] = {}
     for entry in sets:
-        named = re.fullmatch(r"([\w-]+)=(.+)", entry)
-        file = Path(named[2] if named else entry)
-        stem = normalize("NFC", file.stem)  # macOS writes ö as o and its dots, which are no letter
-        name = named[1] if named else re.sub(r"[^\w-]+", "-", stem)
+        before, _, after = entry.partition("=")
+        name = normalize("NFC", before)  # macOS writes ö as o and its dots, which are no letter
+        file = Path(after)
+        if not (after and re.fullmatch(r"[\w-]+", name)):
+            file = Path(entry)
+            name = re.sub(r"[^\w-]+", "-", normalize("NFC", file.stem))
         if name in files:
             raise QfolioError(
                 f"{files[name]} and {file} are both called {name}; name one with NAME=FILE."

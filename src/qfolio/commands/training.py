@@ -95,6 +95,7 @@ def train(
     from qfolio.commands.progress import stop
     from qfolio.experiments import presets
     from qfolio.experiments.interrupts import resumable
+    from qfolio.experiments.lasting import lasting
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on as executor_of
     from qfolio.experiments.run import Run
@@ -140,7 +141,8 @@ def train(
         contrast = None
         if compare:
             try:
-                contrast = _contrast(run, folder, executor)
+                with lasting():  # whose end is not that of the run
+                    contrast = _contrast(run, folder, executor)
             except QfolioError as error:  # the grade and the report do not need it
                 console.say(f"The training for contrast is left out. {error}")
         if contrast is not None and contrast.interrupted:

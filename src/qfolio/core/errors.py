@@ -93,14 +93,14 @@ def require_methods(kind: type, *bases: type) -> None:
 def needs(*packages: str, otherwise: str) -> Iterator[None]:
     """Raises QfolioError if an import within it lacks one of some optional packages.
 
-    otherwise: what it says. A package that is there, but cannot be imported, raises its own error.
+    otherwise: what it says, unless the package is there, but cannot be imported.
     """
     try:
         yield
-    except ModuleNotFoundError as error:
-        if error.name not in packages:
-            raise
-        raise QfolioError(otherwise) from None
+    except ImportError as error:
+        if isinstance(error, ModuleNotFoundError) and error.name in packages:
+            raise QfolioError(otherwise) from None
+        raise QfolioError(f"{packages[0]} cannot be imported: {one_line(error)}.") from None
 
 
 def _is(value: object, kinds: type | UnionType | tuple[type, ...]) -> bool:

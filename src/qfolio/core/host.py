@@ -241,15 +241,10 @@ class HostPopulation(Population):
 
     def policy(self, member: int = 0) -> Callable[[Any], Any]:
         """Takes an observation, and returns the action, in the environment's own format."""
-        inner, facts, (shape, kind) = super().policy(member), self.task.facts, self.task.observation
+        inner, facts, (_, kind) = super().policy(member), self.task.facts, self.task.observation
 
         def policy(observation: Any) -> Any:
-            seen: np.ndarray = np.asarray(facts.seen(observation), kind)
-            if seen.shape != shape:
-                raise QfolioError(
-                    f"The observation has the shape {seen.shape}; {name_of(self.task)} has {shape}."
-                )
-            return facts.given(inner(seen)[None])[0]
+            return facts.given(inner(np.asarray(facts.seen(observation), kind))[None])[0]
 
         return policy
 

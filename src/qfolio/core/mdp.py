@@ -215,7 +215,7 @@ class Task(eqx.Module):
 
 
 def task_jit(function: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
-    """``eqx.filter_jit`` of a function whose first argument is a task.
+    """``eqx.filter_jit`` of a function whose first argument, by position, is a task.
 
     It compiles anew if what the task refers to differs, see ``Task.referents``.
     """

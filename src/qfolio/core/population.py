@@ -16,6 +16,7 @@ from qfolio.core.devices import Members, require_memory
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import CURVE_STARTS, STARTS, Greedy, evaluate, tail_steps
 from qfolio.core.mdp import Agent, Task
+from qfolio.core.registry import name_of
 from qfolio.core.training import Episodes, TrainingState, advance, begin, chunk_steps, episode_steps
 
 LARGE = 1000
@@ -180,12 +181,21 @@ class Population:
         return faults.find(task, agent, self.seeds[member])
 
     def policy(self, member: int = 0) -> Callable[[PyTree], PyTree]:
-        """A member's greedy policy as it is now: a function of one observation to its action."""
+        """A member's greedy policy as it is now: a function of one observation to its action.
+
+        It raises QfolioError for an observation of another shape.
+        """
         weights = jax.tree.map(lambda x: x[member], self.weights())
-        _, agent = self._member(member)
+        task, agent = self._member(member)
         act = jax.jit(lambda weights, seen: agent.policy(weights, seen))
+        known = jax.eval_shape(lambda: task.observe(task.reset(jax.random.key(0))))
+        shape = jax.tree.map(np.shape, known)
 
         def policy(observation: PyTree) -> PyTree:
+            if (given := jax.tree.map(np.shape, observation)) != shape:
+                raise QfolioError(
+                    f"The observation has the shape {given}; that of {name_of(task)} is {shape}."
+                )
             seen = jax.tree.map(lambda x: np.asarray(x)[None], observation)
             return jax.tree.map(lambda x: np.asarray(x)[0], act(weights, seen))
 

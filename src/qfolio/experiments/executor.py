@@ -118,14 +118,13 @@ def carry_out(
     comes first in each job. members: of the experiment, if some have been trained before (default:
     those of the jobs).
     """
-    sizes = {job.name: len(job.members) for job in jobs}
-    left = sum(sizes.values())
+    left = sum(len(job.members) for job in jobs)
     whole = max(members, left)
     log.queue([job.name for job in jobs])
 
     def listeners(job: Job) -> Sequence[Listener]:
         assert isinstance(job, MembersJob)
-        done, share = (whole - left) / whole, sizes[job.name] / whole
+        done, share = (whole - left) / whole, len(job.members) / whole
         return [log.job(job.name, job.members), *listen(job, done, share)]
 
     with (
@@ -134,7 +133,8 @@ def carry_out(
     ):
         for job, result in finished:
             store(job, result)
-            left -= sizes[job.name]
+            assert isinstance(job, MembersJob)
+            left -= len(job.members)
         log.settle(not left)
         return stop.is_set()
 

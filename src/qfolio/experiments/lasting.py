@@ -27,14 +27,14 @@ def lasting() -> Iterator[None]:
 
     So trackers hear of the grades, and an error while grading is one of the work.
     """
-    with Lasting() as kept:
-        token = _now.set(kept)
+    with Lasting() as logs:
+        token = _now.set(logs)
         try:
             yield
         finally:
             _now.reset(token)
 
 
-def kept() -> Lasting | None:
-    """The logs of the block around this call."""
+def current() -> Lasting | None:
+    """The logs of the innermost block around this call."""
     return _now.get()

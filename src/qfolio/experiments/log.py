@@ -20,7 +20,7 @@ from qfolio.core.errors import QfolioError, one_line, told
 from qfolio.core.files import naming
 from qfolio.experiments.events import BEAT, EVENTS
 from qfolio.experiments.fit import Listener, Training
-from qfolio.experiments.lasting import kept
+from qfolio.experiments.lasting import current
 from qfolio.experiments.records import Records
 
 SHARE, SHORTEST, LONGEST = 0.05, 0.05, 1.0
@@ -46,8 +46,9 @@ class Tracker:
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Called with numbers by name; with several jobs, the names are ``job/metric``.
 
-        Grades are ``result/agent/measure``. They come after the training, where a command trains.
-        step: environment steps of each of the job's members.
+        step: environment steps of each of the job's members. Grades are ``result/agent/measure``;
+            a command logs them after its training, at its largest step. A search logs those of its
+            best so far after each batch, at the number of its trials.
         """
 
     def event(self, event: Mapping[str, Any]) -> None:
@@ -80,7 +81,7 @@ class Log:
         self.folder, self._file = folder, -1
         self._trackers: list[Tracker] = []
         self._telling = threading.Lock()
-        self._step = 0  # the last that trackers were told
+        self._step = 0  # the largest that trackers were told
         self.state = "done"  # how the work ends, unless an error ends it
 
     @contextlib.contextmanager
@@ -89,14 +90,19 @@ class Log:
 
         Within ``lasting`` it ends with that block, and goes on if it is opened there again.
         """
-        outer = kept()
+        outer = current()
         if outer is None or self.folder is None:
             with self._opened(about) as log:
                 yield log
             return
         if self.folder not in outer.logs:
             outer.logs[self.folder] = outer.enter_context(self._opened(about))
-        yield outer.logs[self.folder]
+        log = outer.logs[self.folder]
+        try:
+            yield log
+        except BaseException as error:  # which the block around may catch
+            log.state = "failed" if isinstance(error, Exception) else "stopped"
+            raise
 
     @contextlib.contextmanager
     def _opened(self, about: Mapping[str, Any]) -> Iterator["Log"]:
@@ -147,8 +153,13 @@ class Log:
         """
         return JobLog(self, name, members, since)
 
-    def result(self, values: Mapping[str, Mapping[str, float | None]]) -> None:
-        """Logs the measures of trained agents, by name."""
+    def result(
+        self, values: Mapping[str, Mapping[str, float | None]], step: int | None = None
+    ) -> None:
+        """Logs the measures of trained agents, by name.
+
+        step: what trackers are told (default: the largest before).
+        """
         self.write("result", values=values)
         known = {
             f"result/{name}/{measure}": x
@@ -156,7 +167,8 @@ class Log:
             for measure, x in measures.items()
             if x is not None and math.isfinite(x)
         }
-        self._tell(lambda tracker: tracker.log(known, self._step))
+        at = self._step if step is None else step
+        self._tell(lambda tracker: tracker.log(known, at))
 
     def track(self, job: str, step: int, values: Mapping[str, Sequence[float | None]]) -> None:
         """Passes the means over members to the trackers."""
@@ -167,7 +179,7 @@ class Log:
                 for name, each in values.items()
             }
             means = {f"{prefix}{k}": sum(x) / len(x) for k, x in known.items() if x}
-            self._step = step
+            self._step = max(self._step, step)
             self._tell(lambda tracker: tracker.log(means, step))
 
     def _tell(self, tell: Callable[[Tracker], None]) -> None:
@@ -302,7 +314,7 @@ def add_result(folder: Path | None, values: Mapping[str, Mapping[str, float | No
 
     Trackers hear of them within ``lasting``; else they have finished by then.
     """
-    outer = kept()
+    outer = current()
     if outer is not None and folder in outer.logs:
         outer.logs[folder].result(values)
     elif folder is not None and (folder / EVENTS).exists():

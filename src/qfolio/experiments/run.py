@@ -194,12 +194,14 @@ class Run(Seeds):
         """The greedy policy of a seed as it is now: a function of one observation to an action.
 
         Both are in the format of an environment of Gymnasium; with other tasks they are those of
-        ``task.observe`` and ``task.step``.
+        ``task.observe`` and ``task.step``. Make the function once: each is compiled anew.
         seed: one of the run's seeds (default: the first); QfolioError for others.
         """
         seeds = self.population.seeds
         if seed is not None and seed not in seeds:
-            raise QfolioError(f"seed is {seed}; the run has {seeds[0]} to {seeds[-1]}.")
+            raise QfolioError(
+                f"seed is {seed}; the first of this run is {seeds[0]}, and the last {seeds[-1]}."
+            )
         return self.population.policy(0 if seed is None else seeds.index(seed))
 
     def grade(self, starts: int | None = None) -> dict[str, Any]:

@@ -27,7 +27,10 @@ def test_a_number_holds_from_its_date_until_the_next(tmp_path):
 
 def test_the_dates_may_come_last(tmp_path):
     rate = tmp_path / "bills.csv"
-    for text in ("rate,date\n0.01,2020-01-01\n", "other,bills,date\n7,0.01,2020-01-01\n"):
+    for text in (
+        "rate,date\n0.01,2020-01-01\n", "other,bills,date\n7,0.01,2020-01-01\n",
+        "day,bills,time\n2020-01-01,0.01,16:00\n", ",bills,timestamp\n7,0.01,2020-01-01\n",
+    ):  # fmt: skip
         rate.write_text(text)
         loaded = load(table(tmp_path / "prices.csv"), columns=[f"bills={rate}"])
         assert (loaded.market == 0.01).all()

@@ -191,6 +191,7 @@ def test_jobs_that_work_was_divided_into_before_leave_the_page(
     browser.show(board.url, 1280, f"{said} === 'dqn/0,dqn/1'")
     write(begin, trained("dqn"), {"event": "done", "job": "dqn"})
     browser.wait(f"{said} === 'dqn/0,dqn/1,dqn'")
+    assert browser.evaluate("linesOf(groups()[0], 'return')[0].job.name") == "dqn"
     write({"event": "end", "state": "done", "pid": 1, "host": "h"})
     browser.wait("document.getElementById('jobs').hidden")
     jobs = "[...details.values()].flatMap((detail) => [...detail.jobs.keys()])"
@@ -354,15 +355,16 @@ def test_seeds_that_train_apart_are_drawn_as_if_together(
 ) -> None:
     """One is logged at other steps, and its last record comes a little earlier."""
     first, second = curve("dqn/0", 0.0, 10.0, 20.0), curve("dqn/1", 4.0, 24.0, steps=14)
+    second[0]["members"] = ["seed 1", "seed 2", "seed 3"]
     finished(tmp_path / "runs" / "seeds", "run", ["dqn"], *first, *second)
     browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 1")
     assert browser.evaluate("document.querySelectorAll('#charts .band').length") == 1
     points = browser.evaluate("linesOf(groups()[0], 'return')[0].points")
     there = 4 + 20 * 6 / 14  # on the line between the second one's points
     assert points == [
-        [10, 2, 0, 4],
-        [20, pytest.approx((10 + there) / 2), 10, pytest.approx(there)],
-        [30, 22, 20, 24],
+        [10, 3, 0, 4],  # the second job has three of the four seeds
+        [20, pytest.approx((10 + 3 * there) / 4), 10, pytest.approx(there)],
+        [30, 23, 20, 24],
     ]
     assert browser.evaluate("document.querySelectorAll('.cell').length") == 2
 
@@ -406,13 +408,13 @@ def test_results_come_before_the_curves_and_keep_words_whole_on_a_phone(
     assert browser.evaluate("document.documentElement.scrollWidth") <= 390
 
 
-def test_a_study_says_where_its_results_are(board: Board, browser: Browser, tmp_path: Path) -> None:
-    finished(tmp_path / "runs" / "study", "study", ["tilts"], *curve("us/lag1/tilts/2001", 1.0))
-    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 1")
-    assert browser.evaluate("document.getElementById('results').hidden")
-    (tmp_path / "runs" / "study" / "report.html").write_text("<title>study</title>")
-    browser.wait("!document.getElementById('results').hidden")
-    assert "Its report has them" in browser.evaluate("document.getElementById('results').innerText")
+def test_a_study_shows_what_it_found(board: Board, browser: Browser, tmp_path: Path) -> None:
+    found = {"active_growth": 0.029, "low": 0.02, "high": 0.039, "z": 6.4}
+    said = {"event": "result", "values": {"tilts": found}}
+    finished(tmp_path / "runs" / "a", "study", ["tilts"], *curve("us/lag1/tilts/2001", 1.0), said)
+    browser.show(board.url, 1280, "!document.getElementById('results').hidden")
+    rows = browser.evaluate("document.getElementById('results-rows').innerText").split()
+    assert rows == ["tilts", "2.90%", "2.00%", "3.90%", "6.40"]
 
 
 def test_the_page_says_that_folders_were_left_out(

@@ -19,7 +19,7 @@ def describe_search(work: "Tuning") -> list[str]:
     config, budget = work.config, work.config.budget
     seeds = amount(config.seeds, "seed")
     outside = [
-        f"{dim.name}={written(value)}"
+        f"{dim.name}={written(value)}, which is outside {dim}"
         for dim in work.space
         if not dim.covers(value := own_value(work.agent, dim))
     ]

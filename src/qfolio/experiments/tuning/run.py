@@ -251,7 +251,7 @@ class Tuning:
                     break
                 if listener is not None:
                     listener(now)
-                log.result(self._results(now.best, now.preset))
+                log.result(self._results(now.best, now.preset), now.done)
                 self.interrupted &= now.done < total
             log.settle(not self.interrupted)
 

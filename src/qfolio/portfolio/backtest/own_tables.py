@@ -21,12 +21,12 @@ from qfolio.portfolio.prices.records import date_column, dates_of, in_order, num
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.prices.vocabulary import (
     ASSET_NAMES,
+    RETURN_NAMES,
     SHARES_NAMES,
     is_cash,
     plain,
 )
 
-RETURN_NAMES = ("return", "returns", "ret", "net return", "net returns", "daily return")
 WEIGHT_NAMES = ("weight", "weights", "target", "target weight")
 
 ROUNDING = 1e-3

@@ -15,9 +15,13 @@ from qfolio.portfolio.prices.vocabulary import DATE_NAMES, plain
 
 
 def date_column(names: tuple[str, ...]) -> int:
-    """The column of dates: one that is called so, else the first."""
+    """The column of dates: one called date, else the first.
+
+    If the first has no name, such as row numbers, it is one that is called like a time.
+    """
     known = [plain(name) for name in names]
-    return next((known.index(name) for name in DATE_NAMES if name in known), 0)
+    names_of_dates = DATE_NAMES if names and not known[0] else DATE_NAMES[:3]
+    return next((known.index(name) for name in names_of_dates if name in known), 0)
 
 
 def dates_of(table: Table, column: int) -> np.ndarray:

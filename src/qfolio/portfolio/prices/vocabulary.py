@@ -8,7 +8,7 @@ SHARES_NAMES = ("shares", "quantity", "qty", "units", "position")
 CASH = "cash"
 ADJUSTED_NAMES = ("adjusted close", "adj close", "adjclose", "adjusted price", "adj price")
 PRICE_NAMES = ("close", "price", "value")
-RETURN_NAMES = ("return", "returns", "ret")
+RETURN_NAMES = ("return", "returns", "ret", "net return", "net returns", "daily return")
 SETTINGS = (
     "security", "securities", "start date", "end date", "period", "periodicity", "currency",
 )  # fmt: skip

@@ -31,6 +31,7 @@ class Shelf:
         self.root = root.resolve()
         self._experiments: dict[str, Experiment] = {}
         self._version, self._read = 0, -FRESH
+        self._next = 0.0  # when to search for logs again, by perf_counter
         self._searched = True
         self._lock = threading.Lock()
 
@@ -85,6 +86,17 @@ class Shelf:
         if perf_counter() - self._read < FRESH:
             return
         self._version += 1
+        begun = perf_counter()
+        if begun >= self._next:
+            self._search()
+            # A large tree is searched for a twentieth of the time, a small one at each answer.
+            self._next = perf_counter() + 20 * max(0.0, perf_counter() - begun - 0.01)
+        until = perf_counter() + READING
+        for experiment in self._experiments.values():
+            experiment.refresh(self._version, until)
+        self._read = perf_counter()
+
+    def _search(self) -> None:
         found = {}
         logs, self._searched = _logs(str(self.root), FOLDERS)
         for log in logs:
@@ -94,10 +106,6 @@ class Shelf:
             key = hashlib.sha256(log.encode(errors="surrogateescape")).hexdigest()[:16]
             found[key] = self._experiments.get(key) or Experiment(_readable(name), path)
         self._experiments = found
-        until = perf_counter() + READING
-        for experiment in found.values():
-            experiment.refresh(self._version, until)
-        self._read = perf_counter()
 
 
 def _readable(name: str) -> str:

@@ -341,10 +341,7 @@ function results(shown) {
       rows.push([shown.length > 1 ? `${run.name} · ${name}` : name, values]);
     }
   }
-  const pooled = Boolean(!rows.length && shown.length === 1 && shown[0].kind === "study" && shown[0].report);
-  find("results").hidden = !rows.length && !pooled;
-  find("pooled").hidden = !pooled;
-  find("results").querySelector(".scroll").hidden = pooled;
+  find("results").hidden = !rows.length;
   table(find("results-head"), [["", ...columns.map((key) => key.replaceAll("_", " "))]], "th");
   table(find("results-rows"), rows.map(([name, values]) => [name, ...columns.map((key) => result(key, values[key]))]), "td");
 }
@@ -363,7 +360,9 @@ const LEFT = 46, RIGHT = 8, TOP = 12, BOTTOM = 22, HEIGHT = 208;
 const pen = document.createElement("canvas").getContext("2d"); // measures labels
 
 function linesOf(group, name) {
-  const jobs = group.jobs.filter((job) => Object.hasOwn(job.curves, name) && job.curves[name].length);
+  const known = group.jobs.filter((job) => Object.hasOwn(job.curves, name) && job.curves[name].length);
+  const whole = known.find((job) => job.name === group.name); // after it had been divided
+  const jobs = apart(group.run) && whole ? [whole] : known;
   const lines = jobs.map((job) => ({
     group, job, points: job.curves[name], alone: group.jobs.length === 1,
     band: group.jobs.length === 1 && job.members > 1, now: stateOf(group.run, job) === "running",
@@ -376,10 +375,11 @@ function together(jobs, name) { // the curve of seeds that are trained apart, at
   const curves = jobs.map((job) => job.curves[name]);
   const furthest = curves.reduce((a, b) => (b.at(-1)[0] > a.at(-1)[0] ? b : a));
   return furthest.map(([step]) => {
-    const there = curves.filter((points, i) => jobs[i].state === "done" || points.at(-1)[0] >= step)
-      .map((points) => between(points, step));
-    return [step, there.reduce((sum, p) => sum + p[1], 0) / there.length,
-      Math.min(...there.map((p) => p[2])), Math.max(...there.map((p) => p[3]))];
+    const there = jobs.filter((job, i) => job.state === "done" || curves[i].at(-1)[0] >= step);
+    const at = there.map((job) => between(job.curves[name], step));
+    const seeds = there.map((job) => job.members || 1), all = seeds.reduce((sum, count) => sum + count, 0);
+    return [step, at.reduce((sum, p, i) => sum + seeds[i] * p[1], 0) / all,
+      Math.min(...at.map((p) => p[2])), Math.max(...at.map((p) => p[3]))];
   });
 }
 
