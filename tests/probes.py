@@ -6,6 +6,8 @@ import jax.numpy as jnp
 
 from qfolio.core.market import View
 from qfolio.core.mdp import Box, Discrete, Simplex, Step, Task
+from qfolio.portfolio.rewards import Reward
+from qfolio.portfolio.synthetic.kelly import Kelly
 
 TERMINATED, GOES_ON = jnp.array(True), jnp.array(False)
 
@@ -133,3 +135,18 @@ class AimPlainWeights(AimWeights):
 
     def observe(self, state):
         return state[None]
+
+
+class Bonus(Reward):
+    """The same at each step; tests define it again, with another value."""
+
+    value = 1.0
+
+    def __call__(self, state, outcome):
+        return jnp.asarray(self.value), None
+
+
+class Rewarded(Kelly):
+    """A market with that reward."""
+
+    reward = f"{__name__}:Bonus"

@@ -4,7 +4,6 @@ import importlib.util
 import sys
 
 import gymnasium
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -14,9 +13,8 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.prices.table import Prices
-from qfolio.portfolio.rewards import Reward
-from qfolio.portfolio.synthetic.kelly import Kelly
 
+import probes
 from tables import featured_table
 
 ROWS, WINDOW, HORIZON = 60, 5, 12
@@ -313,29 +311,18 @@ def test_rewards_by_name():
     np.testing.assert_allclose(growth["mean-variance"], wealth - 1 - 1.5 * (wealth - 1) ** 2)
 
 
-class Bonus(Reward):
-    value = 1.0
-
-    def __call__(self, state, outcome):
-        return jnp.asarray(self.value), None
-
-
-class Rewarded(Kelly):
-    reward = f"{__name__}:Bonus"
-
-
 def test_a_reward_that_is_defined_again_is_the_one_that_is_earned(monkeypatch):
     """As in a notebook whose cell is run again: environments of equal settings share programs."""
 
     def earned():
-        market = gym.TaskEnv(f"{__name__}:Rewarded")
-        table = environment(reward=f"{__name__}:Bonus").unwrapped
+        market = gym.TaskEnv("probes:Rewarded")
+        table = environment(reward="probes:Bonus").unwrapped
         for env in (market, table):
             env.reset(seed=0)
             yield env.step(np.eye(env.action_space.shape[0], dtype=np.float32)[0])[1]
 
     assert [*earned()] == [1, 1]
-    monkeypatch.setattr(sys.modules[__name__], "Bonus", type("Bonus", (Bonus,), {"value": 2.0}))
+    monkeypatch.setattr(probes, "Bonus", type("Bonus", (probes.Bonus,), {"value": 2.0}))
     assert [*earned()] == [2, 2]
 
 

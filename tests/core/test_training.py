@@ -1,5 +1,4 @@
 import os
-import sys
 
 import equinox as eqx
 import jax
@@ -17,9 +16,8 @@ from qfolio.core.fields import number
 from qfolio.core.mdp import Step
 from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin, chunk_steps
-from qfolio.portfolio.rewards import Reward
-from qfolio.portfolio.synthetic.kelly import Kelly
 
+import probes
 from populations import assert_same, stored, train_to
 from probes import Endless, Explosive, RewardDelay
 
@@ -51,27 +49,16 @@ def test_members_of_another_number_share_programs(task, agent):
     assert_same(small.fetch(), first)
 
 
-class Bonus(Reward):
-    value = 1.0
-
-    def __call__(self, state, outcome):
-        return jnp.asarray(self.value), None
-
-
-class Rewarded(Kelly):
-    reward = f"{__name__}:Bonus"
-
-
 def test_a_reward_that_is_defined_again_is_the_one_that_trains(monkeypatch):
     """Programs of equal settings are shared, unless these mean another class."""
-    task, agent = Rewarded(horizon=5), A2C(hidden=(2,), num_envs=1)
+    task, agent = probes.Rewarded(horizon=5), A2C(hidden=(2,), num_envs=1)
 
     def one_return():
         return trained(task, agent, [0], [5])[1][0].returns[0, 4, 0]
 
     before = learning_of(task, agent)
     assert one_return() == 5
-    monkeypatch.setattr(sys.modules[__name__], "Bonus", type("Bonus", (Bonus,), {"value": 2.0}))
+    monkeypatch.setattr(probes, "Bonus", type("Bonus", (probes.Bonus,), {"value": 2.0}))
     assert one_return() == 10
     assert learning_of(task, agent) is not before
 
