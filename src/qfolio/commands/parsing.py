@@ -192,15 +192,14 @@ def outcome(folder: Path, content: Document) -> Document:
 
 def _report(command: Callable[..., Any], given: dict[str, Any], as_json: bool) -> None:
     """Runs a command; with ``as_json``, prints only its document to the standard output."""
+    command = lasting()(command)
     if not as_json:
-        with lasting():
-            command(**given)
+        command(**given)
         return
     failed = None
     with contextlib.redirect_stdout(sys.stderr):
         try:
-            with lasting():
-                document = command(**given)
+            document = command(**given)
         except Failed as failure:
             failed, document = failure, failure.document
     print(json.dumps(finite(document), indent=2, allow_nan=False, default=str))

@@ -191,7 +191,10 @@ def test_jobs_that_work_was_divided_into_before_leave_the_page(
     browser.show(board.url, 1280, f"{said} === 'dqn/0,dqn/1'")
     write(begin, trained("dqn"), {"event": "done", "job": "dqn"})
     browser.wait(f"{said} === 'dqn/0,dqn/1,dqn'")
-    assert browser.evaluate("linesOf(groups()[0], 'return')[0].job.name") == "dqn"
+    (line,) = browser.evaluate(
+        "linesOf(groups()[0], 'return').map((line) => [line.job.name, line.alone])"
+    )
+    assert line == ["dqn", True]
     write({"event": "end", "state": "done", "pid": 1, "host": "h"})
     browser.wait("document.getElementById('jobs').hidden")
     jobs = "[...details.values()].flatMap((detail) => [...detail.jobs.keys()])"

@@ -216,10 +216,9 @@ class Comparison:
         for name in self.entrants:
             known = _measures(self.results[name]) if name in self.results else {}
             seconds = self.results[name].seconds_train if name in self.results else None
-            missed = known.get("regret")
-            regret = "–" if missed is None else share(missed)
-            earned = four_digits(known.get("return"))
-            rows.append((name, earned, regret, four_digits(seconds), self.failures.get(name, "")))
+            earned, missed = known.get("return"), known.get("regret")
+            cells = (four_digits(earned), "–" if missed is None else share(missed))
+            rows.append((name, *cells, four_digits(seconds), self.failures.get(name, "")))
         done = f"{len(self.results)} of {len(self.entrants)} agents"
         seeds = amount(config.seeds, "seed")
         header = ("agent", "return", "regret", "seconds", "")

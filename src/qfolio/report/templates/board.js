@@ -361,11 +361,10 @@ const pen = document.createElement("canvas").getContext("2d"); // measures label
 
 function linesOf(group, name) {
   const known = group.jobs.filter((job) => Object.hasOwn(job.curves, name) && job.curves[name].length);
-  const whole = known.find((job) => job.name === group.name); // after it had been divided
-  const jobs = apart(group.run) && whole ? [whole] : known;
+  const whole = apart(group.run) && known.find((job) => job.name === group.name); // after it had been divided
+  const jobs = whole ? [whole] : known, alone = Boolean(whole) || group.jobs.length === 1;
   const lines = jobs.map((job) => ({
-    group, job, points: job.curves[name], alone: group.jobs.length === 1,
-    band: group.jobs.length === 1 && job.members > 1, now: stateOf(group.run, job) === "running",
+    group, job, points: job.curves[name], alone, band: alone && job.members > 1, now: stateOf(group.run, job) === "running",
   }));
   if (!apart(group.run) || lines.length < 2) return lines;
   return [{ group, points: together(jobs, name), alone: true, band: true, now: lines.some((one) => one.now) }];
