@@ -6,6 +6,7 @@ import json
 import math
 import re
 import subprocess
+import sys
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -204,6 +205,7 @@ def test_a_narrow_terminal_folds_names_and_cuts_no_number(monkeypatch, capsys):
     assert capsys.readouterr().out.split("\n")[0].endswith(" longer than the")
 
 
+@pytest.mark.parametrize("terminal", [True, False])
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -220,6 +222,10 @@ def test_a_narrow_terminal_folds_names_and_cuts_no_number(monkeypatch, capsys):
         (["evaluate"], "PATH is missing: folder of a run."),
     ],
 )  # fmt: skip
-def test_wrong_words_are_one_sentence_that_names_the_help(words, said, monkeypatch, capsys):
+def test_wrong_words_are_one_sentence_that_names_the_help(
+    words, said, terminal, monkeypatch, capsys
+):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)  # there, tyro uses colors
     assert typed(monkeypatch, *words) == 2
     assert capsys.readouterr().err == f"qfolio: {said} See qfolio {words[0]} --help.\n"

@@ -140,7 +140,8 @@ def chosen(command: Callable[..., Any], name: str, words: list[str]) -> Callable
 
 def refusal(box: str) -> str:
     """The error in tyro's box, as one sentence."""
-    text = " ".join(re.sub("[╭╮╰╯│]", " ", box).split())
+    plain = re.sub(r"\x1b\[[\d;]*m", "", box)  # tyro colors what it shows in a terminal
+    text = " ".join(re.sub("[╭╮╰╯│]", " ", plain).split())
     parts = [part.strip() for part in re.split("─+|-{3,}", text) if part.strip()]
     said = parts[min(1, len(parts) - 1)]  # after the title
     if found := re.match(r"Unrecognized options?: ([^\s,]+)", said):
