@@ -55,6 +55,8 @@ def random_model(rng: np.random.Generator) -> Itemized:
         borrow_spread=draw(0.02, 0.0),
         borrow_fee=draw("column:fee", "0"),
         carry_rate=draw("column:dividend", "-0.01"),
+        per_share=draw(0.2, 0.0),
+        maximum=draw(0.004, 1.0),
     )
 
 
@@ -110,9 +112,12 @@ class Ledger:
             if change > 0:
                 rates = [rate / (1 - sum(rates)) for rate in rates]
             each = [rate * abs(change) for rate in rates]
+            each[0] += model.per_share * abs(change) / self.prices.values[row, i]
             if abs(target[1 + i] - have / wealth) > 1e-6:
                 each[0] = max(each[0], model.minimum)
                 total += model.fixed
+            if model.maximum < 1:
+                each[0] = min(each[0], model.maximum * abs(change))
             total += sum(each)
             if model.impact:
                 volume = self.known["volume"][row, i] * self.prices.values[row, i]
@@ -200,8 +205,29 @@ def test_commission_alone_is_proportional() -> None:
     assert (Itemized().trade(before, before, Context())[0] == 1).all()
 
 
-def test_jax_equals_numpy_and_its_derivative_is_exact() -> None:
-    model = Itemized(cost=0.004, minimum=30, fixed=5, impact=1, spread="0.001", capital=1e5)
+@pytest.mark.parametrize(
+    ("shares", "price", "commission"),
+    [(1000, 50.0, 5.0), (100, 50.0, 1.0), (10, 1.0, 0.1), (-1000, 0.25, 2.5), (-400, 10.0, 2.0)],
+)
+def test_a_commission_of_each_share(shares: int, price: float, commission: float) -> None:
+    """Half a cent a share, at least 1 and at most 1% of the value: numbers worked out by hand."""
+    model = Itemized(cost=0, per_share=0.005, minimum=1, maximum=0.01, capital=1e6)
+    value = abs(shares) * price / 1e6
+    held, wanted = (value, 0.0) if shares < 0 else (0.0, value)
+    context = Context(columns={"price": np.array([price])})
+    _, paid = model.trade(np.array([1 - held, held]), np.array([1 - wanted, wanted]), context)
+    assert paid["commission"] * 1e6 == pytest.approx(commission, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        Itemized(cost=0.004, minimum=30, fixed=5, impact=1, spread="0.001", capital=1e5),
+        Itemized(cost=0, per_share=0.02, minimum=30, capital=1e5),
+        Itemized(cost=0.001, per_share=0.02, minimum=300, maximum=0.01, capital=1e5),
+    ],
+)
+def test_jax_equals_numpy_and_its_derivative_is_exact(model: Itemized) -> None:
     columns = {"volume": np.full(4, 1e4), "price": np.full(4, 5.0), "volatility": np.full(4, 0.02)}
     context = Context(columns=columns)
     before, after = weights(3, 5), weights(4, 5)

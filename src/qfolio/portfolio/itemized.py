@@ -49,9 +49,10 @@ class Itemized(CostModel):
 
     cost: commission, as a share of the value traded. buy, sell: quantities, further shares of the
     value bought and sold, such as a stamp duty. spread: quantity, the quoted spread as a share of
-    the price, of which a trade pays half. fixed, minimum: fee of each order, and its least
-    commission, in money. impact, impact_power: a trade of the share p of a row's volume moves its
-    price by impact · σ · p^impact_power (a square root by default; 1 is linear), where σ is the
+    the price, of which a trade pays half. fixed: fee of each order, in money. per_share:
+    commission of each share traded, in money, besides ``cost``. minimum, maximum: least commission
+    of an order, in money, and the largest, as a share of the value traded (1: no limit). impact,
+    impact_power: a trade of the share p of a row's volume moves its price by impact · σ · p^impact_power (a square root by default; 1 is linear), where σ is the
     volatility of a row's returns. volume: quantity, in shares. capital: wealth at the start, in
     money. cash_rate: quantity, the rate that cash earns. borrow_spread: rate of a loan above
     ``cash_rate``. borrow_fee: quantity, the rate paid on assets sold short. carry_rate: quantity,
@@ -68,7 +69,9 @@ class Itemized(CostModel):
     sell: str = "0"
     spread: str = "0"
     fixed: float = 0.0
+    per_share: float = 0.0
     minimum: float = 0.0
+    maximum: float = 1.0
     impact: float = 0.0
     impact_power: float = 0.5
     volume: str = "column:volume"
@@ -80,7 +83,9 @@ class Itemized(CostModel):
 
     def __post_init__(self) -> None:
         require(self, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
-        require(self, "fixed minimum impact", lambda x: 0 <= x < math.inf, "at least 0")
+        amounts = "fixed per_share minimum impact"
+        require(self, amounts, lambda x: 0 <= x < math.inf, "at least 0")
+        require(self, "maximum", lambda x: 0 <= x <= 1, "from 0 to 1")
         require(self, "impact_power", lambda x: 0 < x <= 2, "above 0 and at most 2")
         require(self, "capital", lambda x: 0 < x < math.inf, "above 0")
         require(self, "borrow_spread", lambda x: 0 <= x <= 1, "from 0 to 1 per year")
@@ -93,7 +98,8 @@ class Itemized(CostModel):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        named = [*self._read.values(), *["volatility", "price"] * (self.impact > 0)]
+        named = [*self._read.values(), *["volatility"] * (self.impact > 0)]
+        named += ["price"] * (self.impact > 0 or self.per_share > 0)
         financed = any(getattr(self, name) != "0" for name in ("cash_rate", "borrow_fee"))
         timed = financed or self.borrow_spread > 0 or self.carry_rate != "0"
         return tuple(dict.fromkeys([*named, *["years"] * timed]))
@@ -181,6 +187,12 @@ class _Rates:
         # Spending m buys (1 − c)m, so that buying v costs v·c/(1 − c).
         kept = 1 - sum(buying.values())
         buying = {kind: rate / kept for kind, rate in buying.items()}
+        if model.per_share > 0:
+            price = context.columns["price"]
+            there = price > 0  # not before an asset's first price
+            rate = xp.where(there, model.per_share / xp.where(there, price, 1.0), 0.0)
+            buying["commission"] = buying["commission"] + rate
+            selling["commission"] = selling["commission"] + rate
         self.rates = {
             kind: (buying.get(kind, 0), selling.get(kind, 0))
             for kind in dict.fromkeys([*buying, *selling])
@@ -203,12 +215,18 @@ class _Rates:
         bought, sold = (change > 0) * size, (change < 0) * size
         paid = {kind: bought * buy + sold * sell for kind, (buy, sell) in self.rates.items()}
         slope = (change > 0) * self.totals[0] - (change < 0) * self.totals[1]
+        buy, sell = self.rates["commission"]
+        rate = (change > 0) * buy - (change < 0) * sell
         if model.minimum > 0:
             least = self.ordered * model.minimum / self.money
-            buy, sell = self.rates["commission"]
             under = paid["commission"] < least
             paid["commission"] = xp.where(under, least, paid["commission"])
-            slope = slope - under * ((change > 0) * buy - (change < 0) * sell)
+            slope, rate = slope - under * rate, ~under * rate
+        if model.maximum < 1:
+            most = model.maximum * size
+            over = paid["commission"] > most
+            paid["commission"] = xp.where(over, most, paid["commission"])
+            slope = slope + over * (model.maximum * xp.sign(change) - rate)
         if model.fixed > 0:
             paid["fixed"] = self.ordered * model.fixed / self.money
         if model.impact > 0:
