@@ -52,12 +52,13 @@ class Itemized(CostModel):
     the price, of which a trade pays half. fixed: fee of each order, in money. per_share:
     commission of each share traded, in money, besides ``cost``. minimum, maximum: least commission
     of an order, in money, and the largest, as a share of the value traded (1: no limit). impact,
-    impact_power: a trade of the share p of a row's volume moves its price by impact · σ · p^impact_power (a square root by default; 1 is linear), where σ is the
-    volatility of a row's returns. volume: quantity, in shares. capital: wealth at the start, in
-    money. cash_rate: quantity, the rate that cash earns. borrow_spread: rate of a loan above
-    ``cash_rate``. borrow_fee: quantity, the rate paid on assets sold short. carry_rate: quantity,
-    the rate that holding an asset earns besides its price (a dividend paid out), or costs if
-    negative (a management fee); a short position pays it.
+    impact_power: a trade of the share p of a row's volume moves its price by impact · σ ·
+    p^impact_power (a square root by default; 1 is linear), where σ is the volatility of a row's
+    returns. volume: quantity, in shares. capital: wealth at the start, in money. cash_rate:
+    quantity, the rate that cash earns. borrow_spread: rate of a loan above ``cash_rate``.
+    borrow_fee: quantity, the rate paid on assets sold short. carry_rate: quantity, the rate that
+    holding an asset earns besides its price (a dividend paid out), or costs if negative (a
+    management fee); a short position pays it.
 
     Source of the impact: R. Almgren, C. Thum, E. Hauptmann and H. Li, "Direct Estimation of Equity
     Market Impact" (2005); B. Tóth et al., "Anomalous Price Impact and the Critical Nature of
