@@ -163,6 +163,36 @@ def test_no_more_workers_than_jobs():
     assert workers.starts == 0
 
 
+def test_a_place_is_used_as_soon_as_there_is_a_job_for_it():
+    """In a later batch, too, if the first was smaller; one that waits for jobs comes first."""
+    batches = [[Job("first")], [Job("alone")], [Job(f"later/{i}") for i in range(8)]]
+
+    def jobs():
+        given = 0
+        for batch in batches:
+            yield from batch
+            given += len(batch)
+            while len(finished) < given:
+                yield None
+
+    class Noting(Simulated):
+        def send(self, worker, job):
+            ran[job.name] = worker
+            super().send(worker, job)
+
+        def receive(self, seconds):
+            return super().receive(seconds) if self.events else []
+
+    finished, ran, workers = list[str](), dict[str, int](), Noting(4, start_seconds=0.5)
+    run = dispatch(lambda: contextlib.nullcontext(workers), jobs(), lambda job: ())
+    for job, _ in run:
+        finished.append(job.name)
+    assert (ran["first"], ran["alone"]) == (0, 0)
+    assert [name for name in ran if name.startswith("later")] == [f"later/{i}" for i in range(8)]
+    assert set(ran.values()) == {0, 1, 2, 3}
+    assert workers.starts == 4
+
+
 def test_jobs_are_taken_when_a_worker_is_free():
     taken = []
 

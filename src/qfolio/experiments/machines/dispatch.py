@@ -5,9 +5,9 @@ writes files or a report.
 """
 
 import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import AbstractContextManager
-from itertools import chain, islice, takewhile
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -131,15 +131,23 @@ def drive(
     Raises:
         QfolioError: A job failed or lost too many workers, or no worker starts.
     """
-    jobs = iter(jobs)
-    first = list(takewhile(lambda job: job is not None, islice(jobs, workers.count)))
-    if not first:
-        return
-    schedule, idle, there = Schedule(chain(first, jobs)), list[int](), set(range(len(first)))
-    for worker in there:
-        workers.start(worker)
-    wanted = versions()
-    while not (schedule.finished or stop.is_set()):
+    schedule, wanted = Schedule(jobs), versions()
+    idle, there, unused = list[int](), set[int](), deque(range(workers.count))
+    while True:
+        while idle and not stop.is_set():
+            if (job := schedule.give(idle[-1])) is None:
+                break
+            worker = idle.pop()
+            tell(job, _Began())
+            workers.send(worker, job)
+        if unused and not idle:
+            coming = len(there) - schedule.running  # workers that start, and will take jobs, too
+            for _ in range(schedule.waiting(coming + len(unused)) - coming):
+                worker = unused.popleft()
+                there.add(worker)
+                workers.start(worker)
+        if schedule.finished or stop.is_set():
+            return
         for worker, said in workers.receive(PATIENCE):
             if isinstance(said, Ready):
                 _require_same(said, wanted)
@@ -161,12 +169,6 @@ def drive(
                     there.remove(worker)
                     if not there:
                         raise QfolioError(f"No worker stays alive; the last one: {said.why}.")
-        while idle and not stop.is_set():
-            if (job := schedule.give(idle[-1])) is None:
-                break
-            worker = idle.pop()
-            tell(job, _Began())
-            workers.send(worker, job)
 
 
 def _require_same(ready: Ready, wanted: dict[str, str]) -> None:

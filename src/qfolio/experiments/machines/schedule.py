@@ -16,34 +16,47 @@ R = TypeVar("R")
 class Schedule(Generic[R]):
     """Gives jobs to workers in order; the job of a lost worker comes first again.
 
-    jobs: taken one by one, when a worker is free; a None means that there is no job at present.
-    Workers are numbers.
+    jobs: taken one by one, when a worker is free or a place for one is; a None means that there is
+    no job at present. Workers are numbers.
     """
 
     def __init__(self, jobs: Iterable[Job[R] | None]) -> None:
         self._jobs, self._exhausted = iter(jobs), False
         self._again: deque[Job[R]] = deque()
+        self._taken: deque[Job[R]] = deque()
         self._running: dict[int, Job[R]] = {}
         self._losses: Counter[str] = Counter()
         self._failed_starts: Counter[int] = Counter()
 
     def give(self, worker: int) -> Job[R] | None:
         """The next job for a worker that is free; None if there is none at present."""
-        if self._again:
-            job: Job[R] | None = self._again.popleft()
-        else:
+        if not self.waiting(1):
+            return None
+        self._running[worker] = (self._again or self._taken).popleft()
+        return self._running[worker]
+
+    def waiting(self, most: int) -> int:
+        """Number of jobs that wait for a worker; takes jobs for as long as there are fewer."""
+        while (count := len(self._again) + len(self._taken)) < most and not self._exhausted:
             try:
                 job = next(self._jobs)
             except StopIteration:
-                self._exhausted, job = True, None
-        if job is not None:
-            self._running[worker] = job
-        return job
+                self._exhausted = True
+            else:
+                if job is None:
+                    break
+                self._taken.append(job)
+        return count
+
+    @property
+    def running(self) -> int:
+        """Number of jobs that workers run."""
+        return len(self._running)
 
     @property
     def finished(self) -> bool:
-        """Whether no job is running, waits to run again, or may still come."""
-        return self._exhausted and not (self._running or self._again)
+        """Whether no job is running, waits, or may still come."""
+        return self._exhausted and not (self._running or self._again or self._taken)
 
     def of(self, worker: int) -> Job[R]:
         """The job that a worker is running."""
