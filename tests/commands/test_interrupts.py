@@ -139,6 +139,8 @@ def test_a_second_ctrl_c_says_how_to_go_on(words, resume, tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT)
     assert done.returncode == 130, done.stderr
     assert done.stderr == f"qfolio: interrupted. Resume with: qfolio {resume}\n"
+    last = read(tmp_path / "run" / EVENTS)[0][-1]
+    assert (last["event"], last["state"]) == ("end", "stopped")
 
 
 @pytest.mark.slow
@@ -222,6 +224,32 @@ def test_ctrl_c_during_the_report_says_how_to_go_on(start, folder, monkeypatch, 
     assert qfolio(monkeypatch, "backtest", "--resume", run) == 0
     assert (run / "report.html").exists()
     assert {name: (run / name).read_bytes() for name in written} == written
+
+
+GRADE = """
+import sys
+from qfolio import cli
+from qfolio.experiments.run import Run
+
+def wait(run):
+    print("here", flush=True)
+    sys.stdin.read()
+
+Run.summary = wait
+cli.main()
+"""
+"""The program, which waits for ever when it is to grade a run."""
+
+
+def test_ctrl_c_during_the_grading_ends_the_log(start, tmp_path):
+    words = ("train", "finite/cliff", "--episodes", 4, "--seeds", 1, "--out", tmp_path / "run")
+    process = start(*words, program=("-c", GRADE), stdin=subprocess.PIPE)
+    while (line := process.stdout.readline()) != "here\n":
+        assert line, process.stderr.read()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(LIMIT) == 130
+    last = read(tmp_path / "run" / EVENTS)[0][-1]
+    assert (last["event"], last["state"]) == ("end", "stopped")
 
 
 def children(parent):

@@ -16,6 +16,7 @@ from qfolio.commands.training import _train
 from qfolio.core.files import locked
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.executor import Here
+from qfolio.experiments.machines import rays
 from qfolio.experiments.run import Run
 
 from jobs import Elsewhere
@@ -133,6 +134,18 @@ def test_live_shows_no_other_task_that_is_resumed(monkeypatch, capsys, tmp_path)
     monkeypatch.setattr("qfolio.commands.training._window", lambda live: nullcontext(print))
     assert qfolio(monkeypatch, "train", "--resume", tmp_path / "run", "--live") == 2
     assert "there is nothing to see of finite/cliff" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["train", "tune"])
+def test_no_cluster_is_asked_for_workers_if_the_results_have_no_place(
+    command, monkeypatch, capsys, tmp_path
+):
+    monkeypatch.setattr(os, "access", lambda place, mode: place != tmp_path)
+    monkeypatch.setattr(rays, "Ray", None)
+    assert qfolio(monkeypatch, command, "--on", "ray", "--out", tmp_path / "run") == 2
+    assert capsys.readouterr().err == (
+        f"qfolio: Nothing can be written to {tmp_path}; name a folder elsewhere with --out.\n"
+    )
 
 
 @pytest.mark.parametrize("begun", [True, False])

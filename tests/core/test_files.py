@@ -23,6 +23,7 @@ from qfolio.core.files import (
     naming,
     new_folder,
     read_arrays,
+    require_new,
     write_arrays,
     write_bytes,
     write_json,
@@ -168,6 +169,20 @@ def test_a_folder_that_cannot_be_replaced_is_refused_before_any_work(tmp_path, m
         pass
 
 
+def test_a_folder_where_nothing_can_be_written_is_refused_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda place, mode: place != tmp_path)
+    for folder in (tmp_path / "run", tmp_path / "not" / "there"):
+        with pytest.raises(QfolioError) as raised:
+            require_new(folder)
+        assert str(raised.value) == (
+            f"Nothing can be written to {tmp_path}; name a folder elsewhere with --out."
+        )
+    with pytest.raises(QfolioError, match=r"name a folder elsewhere\.$"):
+        new_folder(tmp_path / "policy", None).__enter__()
+    (tmp_path / "there").mkdir()
+    require_new(tmp_path / "there" / "run")
+
+
 def test_a_full_disk_is_named_where_only_the_folder_is_known(tmp_path):
     with pytest.raises(OSError, match="No space left") as error, new_folder(tmp_path / "run"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -212,6 +227,32 @@ def test_a_lock_says_who_holds_it(tmp_path):
     with locked(tmp_path):  # a lock ends with its process, however that ends
         pass
     assert [path.name for path in tmp_path.iterdir()] == []
+
+
+def test_two_processes_never_hold_a_folder_at_once(tmp_path, monkeypatch):
+    """Not even if one begins while another deletes the lock's file, and lets go."""
+    fcntl = pytest.importorskip("fcntl")
+    flock, release, place = fcntl.flock, FileLock.release, tmp_path / ".lock"
+
+    def deleted_before(*args):
+        monkeypatch.setattr(fcntl, "flock", flock)
+        place.unlink()
+        return flock(*args)
+
+    lock = FileLock(place)
+    monkeypatch.setattr(fcntl, "flock", deleted_before)
+    with lock, pytest.raises(QfolioError, match="is in use"), locked(tmp_path):
+        pass
+
+    def released_after(other, **options):
+        monkeypatch.setattr(FileLock, "release", release)
+        lock.acquire(timeout=0)
+        other.release(**options)
+
+    with locked(tmp_path):
+        monkeypatch.setattr(FileLock, "release", released_after)
+    with lock, pytest.raises(QfolioError, match="is in use"), locked(tmp_path):
+        pass
 
 
 def test_the_cache_lies_where_the_system_keeps_caches(monkeypatch):

@@ -93,6 +93,7 @@ def train(
     from qfolio.commands import console
     from qfolio.commands.console.training import describe_run
     from qfolio.commands.progress import stop
+    from qfolio.core.files import require_new
     from qfolio.experiments import presets
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.lasting import lasting
@@ -105,6 +106,8 @@ def train(
     budget = budget_of(episodes, steps)
     if live and on != "here":
         raise QfolioError("--live shows a training in this process; leave out --on, or --live.")
+    if resume is None and out is not None:
+        require_new(out)  # before a cluster is asked for workers
     executor = executor_of(on)
     if live and task is not None:
         _require_seen(task)

@@ -88,11 +88,14 @@ def tune(
     from qfolio.commands import console
     from qfolio.commands.console.tuning import describe_search
     from qfolio.commands.progress import print_batch, stop
+    from qfolio.core.files import require_new
     from qfolio.experiments import presets
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on as executor_of
 
+    if join is None and out is not None:
+        require_new(out, "--join")  # before a cluster is asked for workers
     executor, following = executor_of(on), trackers(track)
     budget = budget_of(episodes, steps)
     if join is None:

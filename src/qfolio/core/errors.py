@@ -137,7 +137,9 @@ def told(error: BaseException) -> str | None:
         return str(error)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        return f"{where}{error.strerror or error}."
+        denied = isinstance(error, PermissionError) and error.filename
+        advice = "; get the right to read and write there, or name another place" if denied else ""
+        return f"{where}{error.strerror or error}{advice}."
     return sentence_on(error)
 
 

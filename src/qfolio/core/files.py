@@ -80,7 +80,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def require_new(folder: Path, option: str | None = "--resume") -> None:
-    """Raises QfolioError unless ``folder`` is new, or empty and can be replaced.
+    """Raises QfolioError unless ``folder`` can be made: it is new, or empty and can be replaced.
 
     option: continues the work in it, if it is work.
     """
@@ -94,6 +94,12 @@ def require_new(folder: Path, option: str | None = "--resume") -> None:
     if folder.is_symlink() or os.path.ismount(folder):
         raise QfolioError(
             f"{folder} is a link or a mount point, which no folder can replace; name a new folder."
+        )
+    there = next((place for place in folder.parents if os.path.exists(place)), Path())
+    if not os.access(there, os.W_OK | os.X_OK):
+        how = " with --out" if option else ""
+        raise QfolioError(
+            f"Nothing can be written to {there.resolve()}; name a folder elsewhere{how}."
         )
 
 

@@ -12,7 +12,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from qfolio.core.text import printable
@@ -25,6 +25,9 @@ _trainings: list[threading.Event] = []
 
 _resumes: list[str] = []
 """The command that goes on with the work in the main thread, if it can be resumed."""
+
+_last_acts: list[Callable[[], object]] = []
+"""What is done when Ctrl-C ends the process, from a thread beside the work."""
 
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -67,6 +70,16 @@ def resumable(command: str) -> Iterator[None]:
         _resumes.remove(command)
 
 
+@contextlib.contextmanager
+def before_leaving(act: Callable[[], object]) -> Iterator[None]:
+    """Within the block, Ctrl-C that ends the process first calls ``act``, in another thread."""
+    _last_acts.append(act)
+    try:
+        yield
+    finally:
+        _last_acts.remove(act)
+
+
 def exit_on_ctrl_c() -> None:
     """Makes Ctrl-C end the process with ``EXIT_CODE``, unless it stops a training first."""
     receiver, sender = socket.socketpair()
@@ -82,6 +95,9 @@ def _leave() -> None:
     Nothing is flushed: output is flushed when printed, and a main thread that waits for the reader
     of a pipe would hold the lock.
     """
+    for act in [*_last_acts]:  # of which the main thread may remove some
+        with contextlib.suppress(Exception):
+            act()
     cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
     advice = f". Resume with: {printable(_resumes[-1])}" if _resumes else ""
     with contextlib.suppress(OSError):

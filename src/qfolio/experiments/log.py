@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -20,6 +21,7 @@ from qfolio.core.errors import QfolioError, one_line, told
 from qfolio.core.files import naming
 from qfolio.experiments.events import BEAT, EVENTS
 from qfolio.experiments.fit import Listener, Training
+from qfolio.experiments.interrupts import before_leaving
 from qfolio.experiments.lasting import current
 from qfolio.experiments.records import Records
 
@@ -109,12 +111,13 @@ class Log:
         trackers = _trackers.get()
         with contextlib.ExitStack() as stack:
             if self.folder is not None:
-                self._file = _open(self.folder / EVENTS)
-                stack.callback(self._close)
+                stack.enter_context(self.appending())
                 stack.enter_context(_heartbeat(self.folder / EVENTS))
             here = {"pid": os.getpid(), "host": platform.node()}
             self.write("start", **about, **here)
             stack.callback(self._tell, lambda tracker: tracker.finish())
+            stopped = partial(self._append, "end", state="stopped", **here)
+            stack.enter_context(before_leaving(stopped))
             begin = lambda tracker: tracker.start(self.folder, about)  # noqa: E731
             try:
                 for tracker in trackers:
@@ -129,13 +132,29 @@ class Log:
                 raise
             self.write("end", state=self.state, **here)
 
+    @contextlib.contextmanager
+    def appending(self) -> Iterator[None]:
+        """Within the block, events go to the folder's log, without a start and an end."""
+        assert self.folder is not None
+        self._file = _open(self.folder / EVENTS)
+        try:
+            yield
+        finally:
+            os.close(self._file)
+            self._file, self._trackers = -1, []
+
     def write(self, event: str, **values: Any) -> None:
-        """Appends an event in one write, so that several processes can share a log."""
+        """Appends an event, and tells it to the trackers."""
+        content = self._append(event, **values)
+        self._tell(lambda tracker: tracker.event(content))
+
+    def _append(self, event: str, **values: Any) -> dict[str, Any]:
+        """Appends an event in one write, so that several threads and processes can share a log."""
         content = {"event": event, "time": round(time.time(), 3), **values}
         if self.folder is not None and self._file >= 0:
             with naming(self.folder / EVENTS):
                 os.write(self._file, msgspec.json.encode(content) + b"\n")
-        self._tell(lambda tracker: tracker.event(content))
+        return content
 
     def settle(self, finished: bool) -> None:
         """Sets how the work ends: finished, or stopped early."""
@@ -203,10 +222,6 @@ class Log:
             warnings.warn(f"The tracker {name} is left out: {one_line(error)}", stacklevel=2)
             return False
         return True
-
-    def _close(self) -> None:
-        os.close(self._file)
-        self._file, self._trackers = -1, []
 
 
 class JobLog(Listener):
@@ -319,11 +334,8 @@ def add_result(folder: Path | None, values: Mapping[str, Mapping[str, float | No
         outer.logs[folder].result(values)
     elif folder is not None and (folder / EVENTS).exists():
         log = Log(folder)
-        log._file = _open(folder / EVENTS)
-        try:
+        with log.appending():
             log.result(values)
-        finally:
-            log._close()
 
 
 def _open(path: Path) -> int:
