@@ -1,4 +1,7 @@
-"""Independent ways to the optima of the synthetic markets, for tests of ``qfolio.solvers``."""
+"""Independent ways to the optima of finite processes and of the synthetic markets.
+
+They are for tests of ``qfolio.solvers``.
+"""
 
 import itertools
 import math
@@ -8,7 +11,24 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
+from qfolio.solvers.finite import Model, Values, look_ahead
 from qfolio.solvers.shared import gauss
+
+
+def soft(values: Values, epsilon: float) -> Float[np.ndarray, " state"]:
+    """State values if the action is random with probability ε and otherwise the best."""
+    return (1 - epsilon) * values.max(-1) + epsilon * values.mean(-1)
+
+
+def value_iteration(model: Model, discount: float, epsilon: float = 0.0) -> Values:
+    """Q to within 1e-10, by sweeps over all states, each of which multiplies the error by γ."""
+    values = np.zeros(model.transitions.shape[:2])
+    while True:
+        better = look_ahead(model, soft(values, epsilon), discount)
+        change = float(np.abs(better - values).max())
+        values = better
+        if change * discount <= 1e-10 * (1 - discount):
+            return values
 
 
 def merton(

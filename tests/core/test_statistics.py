@@ -52,13 +52,6 @@ def test_interquartile_mean_equals_trimmed_mean(count: int) -> None:
     )
 
 
-def test_interquartile_mean_takes_any_axis() -> None:
-    values = np.random.default_rng(2).normal(size=(6, 2, 5))
-    np.testing.assert_allclose(
-        interquartile_mean(values, axis=0), interquartile_mean(np.moveaxis(values, 0, -1))
-    )
-
-
 def test_interquartile_mean_of_nothing() -> None:
     with pytest.raises(ValueError, match="at least one"):
         interquartile_mean([])

@@ -8,16 +8,11 @@ import numpy as np
 import pytest
 
 import qfolio
+from optima import soft, value_iteration
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import find
-from qfolio.solvers.finite import (
-    finite_horizon,
-    policy_evaluation,
-    policy_iteration,
-    soft,
-    value_iteration,
-)
+from qfolio.solvers.finite import finite_horizon, policy_evaluation, policy_iteration
 from qfolio.solvers.grid import GridOptimum
 from qfolio.tasks.finite import Cliff, FiniteMDP, FrozenLake, Garnet
 from qfolio.tasks.grid_pendulum import GridPendulum, interpolated

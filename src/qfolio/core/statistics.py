@@ -31,16 +31,15 @@ def regret(returns: ArrayLike, optimum: float | None) -> Floats | None:
     return np.asarray((optimum - np.asarray(returns, dtype=float)) / abs(optimum))
 
 
-def interquartile_mean(values: ArrayLike, axis: int = -1) -> Floats:
-    """Return the mean of the middle half of the values along an axis.
+def interquartile_mean(values: ArrayLike) -> Floats:
+    """Return the mean of the middle half of the values along the last axis.
 
     Values on the edge of the middle half count with the fraction that lies inside, so that the
     result is right for every number of values: the mean for one or two, and for three the middle
     value with weight 2/3 and the outer ones with 1/6 each.
 
     Args:
-        values: Numbers of shape (..., n, ...).
-        axis: The axis of length n that is averaged away.
+        values: Numbers of shape (..., n).
 
     Returns:
         An array without that axis.
@@ -48,7 +47,7 @@ def interquartile_mean(values: ArrayLike, axis: int = -1) -> Floats:
     Raises:
         ValueError: There are no values along the axis.
     """
-    ordered = np.sort(np.moveaxis(np.asarray(values, dtype=float), axis, -1), axis=-1)
+    ordered = np.sort(np.asarray(values, dtype=float), axis=-1)
     count = ordered.shape[-1]
     if count == 0:
         raise ValueError("an interquartile mean needs at least one value")

@@ -1,9 +1,8 @@
 """Exact solutions of finite Markov decision processes (Bellman 1957; Howard 1960), in float64.
 
-Both methods return action values Q, one row for each state: value iteration repeats Bellman's
-equation until the values converge, and policy iteration solves the linear equations of one policy
-after another. With ``epsilon`` both find the best of the policies that take a random action with
-that probability, which SARSA learns.
+Policy iteration, which solves the linear equations of one policy after another, returns action
+values Q, one row for each state. With ``epsilon`` it finds the best of the policies that take a
+random action with that probability, which SARSA learns.
 """
 
 from typing import NamedTuple
@@ -79,26 +78,6 @@ def look_ahead(model: Model, values: Float[np.ndarray, " state"], discount: floa
     """E[r + γ V(s')] of every action in every state."""
     following = model.rewards + discount * values[model.successors]
     return (model.transitions * following).sum(-1)
-
-
-def soft(values: Values, epsilon: float) -> Float[np.ndarray, " state"]:
-    """State values if the action is random with probability ε and otherwise the best."""
-    return (1 - epsilon) * values.max(-1) + epsilon * values.mean(-1)
-
-
-def value_iteration(model: Model, discount: float, epsilon: float = 0.0) -> Values:
-    """Q to within 1e-10, by sweeps over all states, each of which multiplies the error by γ.
-
-    Raises QfolioError unless 0 ≤ discount < 1 and 0 ≤ epsilon ≤ 1.
-    """
-    _require(discount, epsilon)
-    values = np.zeros(model.transitions.shape[:2])
-    while True:
-        better = look_ahead(model, soft(values, epsilon), discount)
-        change = float(np.abs(better - values).max())
-        values = better
-        if change * discount <= 1e-10 * (1 - discount):
-            return values
 
 
 def policy_iteration(model: Model, discount: float, epsilon: float = 0.0) -> Values:
