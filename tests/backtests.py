@@ -48,6 +48,7 @@ def make_data(
             },
             dates,
             periods_per_year=252,
+            reference="equal weight",
             resamples=400,
             earlier_trials=5,
         ),

@@ -1,9 +1,12 @@
 """Made-up track records of strategies, for tests of a backtest's statistics."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qfolio.portfolio.backtest.statistics.assessment import Strategy
+from qfolio.portfolio.backtest.statistics.assessment import Assessment, Strategy, assess
 
 
 def strategy(
@@ -22,3 +25,10 @@ def record(entry: Strategy) -> tuple[ArrayLike, ArrayLike, ArrayLike]:
     assert entry.turnover is not None
     assert entry.cost is not None
     return entry.returns, entry.turnover, entry.cost
+
+
+def assessed(strategies: Mapping[str, Any], dates: ArrayLike, **options: Any) -> Assessment:
+    """The statistics of daily records beside those of equal weight; options: of ``assess``."""
+    return assess(
+        strategies, dates, **{"periods_per_year": 252, "reference": "equal weight", **options}
+    )

@@ -78,25 +78,12 @@ def allocate(
     for option, file in inputs.items():
         if orders is not None and file is not None and file.resolve() == orders.resolve():
             raise QfolioError(f"{option} and --orders name one file; give orders their own.")
-    import msgspec
-    import numpy as np
-
-    from qfolio.core.files import write_csv
-
     prepare(trust)
     from qfolio.commands import console
     from qfolio.commands.console.desk import print_allocation
     from qfolio.commands.console.tables import print_warnings
-    from qfolio.core.text import amount, listed
-    from qfolio.portfolio.desk.allocation import Allocation, require_fresh
+    from qfolio.core.text import listed
     from qfolio.portfolio.desk.desk import Desk
-    from qfolio.portfolio.desk.drivers import reasons, sentence
-    from qfolio.portfolio.desk.holdings import cashed_out, read_holdings
-    from qfolio.portfolio.desk.orders_csv import order_rows
-    from qfolio.portfolio.desk.standing import Standing
-    from qfolio.portfolio.mandate.limits import lots
-    from qfolio.portfolio.policy import Policy
-    from qfolio.portfolio.prices.findings import day
 
     latest.require_table(prices, returns)
     desk = Desk.open(folder, returns=returns, **latest.reading)
@@ -112,85 +99,29 @@ def allocate(
                 f"{listed([name for name, there in given.items() if there])}."
             )
         return _reproduce(desk, reproduce, prices, holdings, capital)
-    name = next(iter(desk.run.agents)) if agent is None else agent
-    standing = Standing.of(folder, name, desk.kind(name))
-    if not anyway:
-        standing.require_sound(desk.resume, named=agent is not None)
-    followed = desk.followed(name)
-    table = desk.table(followed, prices)
-    if table.levels and (holdings or whole_shares or orders):
-        raise QfolioError(
-            "Returns give no share prices; leave out --holdings, --whole-shares and --orders, or "
-            "give a table of prices (--prices, without --returns)."
+    try:
+        made = desk.allocate(
+            agent,
+            prices,
+            holdings,
+            capital,
+            anyway=anyway,
+            whole_shares=whole_shares,
+            as_of=as_of,
+            update=update,
+            orders=orders,
+            layout=layout,
+            currency=currency,
+            dry_run=dry_run,
         )
-    if table.levels and lots(followed.mandate) is not None:
-        raise QfolioError(
-            "The mandate has lots, but returns give no share prices; give a table of prices "
-            "(--prices, without --returns)."
-        )
-    if prices is not None:
-        print_warnings(prices.name, desk.news)
-    require_fresh(table, as_of)
-    held = read_holdings(holdings, table.assets, capital, debts=desk.debts)
-    shares, cash, gone = cashed_out(*held, table)
-    if update:
-        if not isinstance(followed, Policy):
-            raise QfolioError(f"{name} learns nothing; leave out --update.")
-        followed = followed.update(table)
-    hindsight = desk.hindsight(followed, table)
-    if hindsight and not anyway:
-        raise QfolioError(
-            f"{hindsight}; give later prices, or add --anyway, which then records nothing."
-        )
-    spent = desk.spent(followed, table)
-    allocation = Allocation.of(
-        followed,
-        table,
-        shares,
-        cash,
-        whole_shares=whole_shares,
-        spent=spent,
-        debts=desk.debts,
-    )
-    rows = None if orders is None else order_rows(allocation, layout, currency)
-    said, number = "A dry run: nothing is written.", None
-    if orders is not None and rows is not None and not dry_run:
-        write_csv(orders, *rows)  # first: what cannot be ordered is not recorded either
-    if hindsight:
-        said = f"{hindsight}, so that nothing is recorded."
-    elif not dry_run:
-        try:
-            if update and isinstance(followed, Policy):
-                desk.run.keep(name, followed)
-            record, said = desk.record(name, allocation, table, whole_shares)
-        except BaseException:
-            if orders is not None:
-                orders.unlink(missing_ok=True)
-            raise
-        number = record.number
-    if rows is not None and not dry_run:
-        said += f" {orders} has {amount(len(rows[1]), 'order')}."
-    trained, why, notes = None, [], []
-    if isinstance(followed, Policy):
-        why = reasons(followed, table, allocation, spent)
-        trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
-    else:
-        notes = followed.notes(table, allocation.held, spent=spent)
-    print_allocation(allocation, standing, trained, shares=not table.levels)
-    for reason in why:
-        console.tell(f"Why {sentence(reason)}")
-    for line in (*gone, *notes, *desk.terms(followed, table, allocation, spent), said):
+    finally:  # also if it is refused, which the prices may explain
+        if prices is not None:
+            print_warnings(prices.name, desk.news)
+    shares = not made.prices.levels
+    print_allocation(made.allocation, made.standing, made.trained, shares=shares)
+    for line in made.sentences:
         console.tell(line)
-    return {
-        "agent": name,
-        "trained_until": trained,
-        "verdict": standing.verdict or None,
-        "worse": standing.worse,
-        "record": number,
-        **allocation.to_json(),
-        "spent": spent,
-        "reasons": msgspec.to_builtins(why),
-    }
+    return made.to_json()
 
 
 def follow(

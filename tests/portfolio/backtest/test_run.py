@@ -508,7 +508,8 @@ def test_a_wrong_baseline_of_ones_own_is_found_before_the_training(tmp_path, mon
     ("settings", "message"),
     [
         ({"train": "300d"}, "nothing to test"), ({"test": "1 year"}, "like 5y"),
-        ({"train": "259d"}, "260 rows, .*, leave 1 row to test after train=259d, fewer than 2;"),
+        ({"train": "259d"}, "260 rows, .*, leave 1 row to test after train=259d, fewer than 5;"),
+        ({"train": "256d"}, "leave 4 rows to test after train=256d, fewer than 5; shorten it"),
         ({"train": "25d"}, "dqn, fold .*: 24 rows are too few: .* of 20 need at least 32"),
         ({"train": "10d"}, r"rows are too few: .* or lower window \(--set window=…\)"),
         ({"cost": 0.5}, "cost is 0.5"),

@@ -1,75 +1,20 @@
-"""What is said of an allocation's orders."""
+"""Which prices a desk reads, and what its allocations write."""
 
-import jax.numpy as jnp
+import shutil
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.desk.desk import Desk, lookback, waiting
-from qfolio.portfolio.desk.untrained import Rule
-from qfolio.portfolio.policy import Policy
-from qfolio.portfolio.prices.table import Prices, load
-from qfolio.portfolio.task import Portfolio
+from qfolio.portfolio.desk.desk import Desk
+from qfolio.portfolio.desk.ledger import Ledger
+from qfolio.portfolio.prices.table import load
 
-from planted import Known, planted
-from tables import days, random_walk
+from tables import days, random_walk, write_table
 from tiny import PATHWISE
-
-MONTHS = np.arange("2024-01", "2025-01", dtype="datetime64[M]").astype("datetime64[D]")
-WEEKS = np.datetime64("2024-01-05") + 7 * np.arange(10)
-DAYS = np.datetime64("2024-01-05") + np.arange(10)
-
-
-@pytest.mark.parametrize(
-    ("dates", "lag", "said"),
-    [
-        (MONTHS, 1, "1 row later, after about 31 days; if you trade at once"),
-        (WEEKS, 2, "2 rows later, after about 14 days; if you trade at once"),
-        (MONTHS, 0, ""), (DAYS, 1, ""), (DAYS[:1], 1, ""),
-    ],
-)  # fmt: skip
-def test_orders_that_wait_for_weeks_are_named(dates, lag, said):
-    found = " ".join(waiting(Prices(dates, ("A",), np.ones((len(dates), 1))), lag))
-    assert said in found
-    assert bool(found) == bool(said)
-
-
-@pytest.mark.parametrize(
-    ("name", "train", "expanding", "rows"),
-    [
-        ("equal-weight", "100d", True, 0), ("minimum-variance", "100d", True, 500),
-        ("minimum-variance", "100d", False, 101), ("momentum", "100d", True, 361),
-        ("momentum", "100d", False, 101),
-    ],
-)  # fmt: skip
-def test_a_baseline_looks_back_on_its_window(name, train, expanding, rows):
-    """A month of this table has 30 rows."""
-    prices = planted(500)
-    task, rule = Portfolio.of(prices, window=2), baseline(name)
-    followed = Rule(name, rule, prices.assets, task, train=train, expanding=expanding, cap=1.0)
-    what = name if rows else ""
-    assert lookback(followed, prices.dates, prices.month) == (what, rows)
-
-
-@pytest.mark.parametrize(
-    ("settings", "found"),
-    [
-        ({"anchor": "equal-weight"}, ("", 0)),
-        ({"anchor": "minimum-variance"}, ("the agent's anchor", 300)),
-        (
-            {"mandate": {"risk": {"volatility": 0.2, "rows": 100}}},
-            ("the mandate's limit on risk", 101),
-        ),
-    ],
-)
-def test_an_agent_looks_back_with_its_anchor_and_its_limits(settings, found):
-    prices = planted(300)
-    task = Portfolio.of(prices, window=2, **settings)
-    policy = Policy(task, Known("momentum"), jnp.array([0.5]), prices.assets)
-    assert lookback(policy, prices.dates, prices.month) == found
 
 
 def test_prices_without_an_asset_delisted_before_they_begin_are_to_begin_earlier(tmp_path):
@@ -91,3 +36,61 @@ def test_prices_without_an_asset_delisted_before_they_begin_are_to_begin_earlier
         desk.read(latest)
     frame[40:].to_csv(latest)
     assert desk.read(latest).assets == desk.run.prices.assets
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a backtest that has policies, but no verdict."""
+    folder = tmp_path_factory.mktemp("desk") / "run"
+    prices = load(write_table(folder.parent / "prices.csv"))
+    backtest = Backtest.create(
+        prices, {"pathwise": PATHWISE}, out=folder, train="100d", test="80d", seeds=1, baselines=[]
+    )
+    backtest.run()
+    return folder
+
+
+def every_file(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_an_allocation_is_recorded_and_ordered(finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    orders = tmp_path / "orders.csv"
+    of: dict[str, Any] = {"capital": 1000.0, "as_of": "2020-09-16"}
+    with pytest.raises(QfolioError, match="The backtest is not finished, so"):
+        Desk.open(folder).allocate(**of)
+    tried = Desk.open(folder).allocate(**of, anyway=True, orders=orders, dry_run=True)
+    assert tried.sentences[-1] == "A dry run: nothing is written."
+    assert every_file(tmp_path).keys() == every_file(folder).keys()
+    made = Desk.open(folder).allocate(**of, anyway=True, orders=str(orders))
+    assert [record.number for record in Ledger(folder / "ledger").records()] == [1]
+    assert made.record is not None
+    assert made.record.trades == made.allocation.trades.tolist()
+    assert made.trained == "2020-09-16"
+    assert made.sentences[-1].endswith(f"{orders} has 3 orders.")
+    assert made.to_json()["record"] == 1
+    assert sum(sentence.startswith("Why ") for sentence in made.sentences) == 3
+
+
+@pytest.mark.parametrize("update", [False, True])
+def test_what_is_not_recorded_leaves_everything_as_it_was(finished, tmp_path, monkeypatch, update):
+    """An earlier file of orders, too, and no policy that has learned from the new rows."""
+    folder = shutil.copytree(finished, tmp_path / "run")
+    newer, orders = write_table(tmp_path / "newer.csv", rows=270), tmp_path / "orders.csv"
+    orders.write_text("orders of another day")
+    before = every_file(tmp_path)
+    of: dict[str, Any] = {"prices": newer, "capital": 1000.0, "as_of": "2020-09-26"}
+
+    def allocate():
+        return Desk.open(folder).allocate(**of, anyway=True, update=update, orders=orders)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Ledger, "append", lambda *_, **__: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            allocate()
+    assert every_file(tmp_path) == before
+    made = allocate()  # and the next try succeeds
+    assert made.record is not None
+    assert made.record.policy == ("latest-1" if update else "latest")
+    assert orders.read_text().count("MARKET") == 3

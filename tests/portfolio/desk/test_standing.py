@@ -8,10 +8,10 @@ from qfolio.portfolio.desk.standing import Standing
 RESUME = "qfolio backtest --resume run --trust mine"
 
 
-def summary(folder, growth, finding):
+def summary(folder, growth, drawdown, finding):
     difference = {"growth": {"finding": finding}}
     strategy = {
-        "measures": {"growth": {"per_seed": growth}},
+        "measures": {"growth": {"per_seed": growth}, "drawdown": {"per_seed": drawdown}},
         "to_reference": difference,
         "to_rebalanced": None,
     }
@@ -20,17 +20,18 @@ def summary(folder, growth, finding):
 
 
 @pytest.mark.parametrize(
-    ("growth", "finding", "worse"),
+    ("growth", "drawdown", "finding", "worse"),
     [
-        ([0.05, 0.06], "none", False),
-        ([0.05, 0.06], "worse", True),
-        ([0.05, -1.0], "none", True),  # no statistics are left of an account that is lost
+        ([0.05, 0.06], [0.2, 0.3], "none", False),
+        ([0.05, 0.06], [0.2, 0.3], "worse", True),
+        ([0.05, -1.0], [0.2, 1.0], "none", True),  # no statistics are left of a lost account
+        ([0.05, -1.0], [0.2, 0.5], "none", False),  # half of it in three days, on minutes
     ],
 )
 def test_a_policy_that_is_worse_or_loses_everything_is_not_followed_unasked(
-    tmp_path, growth, finding, worse
+    tmp_path, growth, drawdown, finding, worse
 ):
-    summary(tmp_path, growth, finding)
+    summary(tmp_path, growth, drawdown, finding)
     standing = Standing.of(tmp_path, "tilts")
     assert standing.worse is worse
     standing.require_sound(RESUME, named=True)

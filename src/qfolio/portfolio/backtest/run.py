@@ -46,6 +46,7 @@ from qfolio.portfolio.backtest.own import Own, place, require_levels
 from qfolio.portfolio.backtest.plan import Plan
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.statistics import assessment
+from qfolio.portfolio.backtest.statistics.estimates import SHORTEST
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold, preparing
 from qfolio.portfolio.mandate import checks
@@ -175,29 +176,14 @@ class Backtest:
             QfolioError: There is no agent, a name or a setting is invalid, the arguments do not fit
                 the table, or the machine has too little memory.
         """
-        _require_types(agents, strategies, lag=lag, seeds=seeds, seed=seed)
+        _require_arguments(agents, strategies, baselines, task, episodes, cap)
+        for argument, number in (("lag", lag), ("seeds", seeds), ("seed", seed)):
+            require_type(argument, number, Integral, "a whole number")
         require_whole("trials", trials, 0, MOST_TRIALS)
         require_type("expanding", expanding, bool, "True or False")
         for argument, text in (("command", command), ("title", title)):
             require_type(argument, text, str, "text")
-        if task is not None:
-            require_type("task", task, Mapping, 'a dictionary of settings, such as {"window": 20}')
         place = None if out is None else path_of("out", out)
-        if not agents:
-            raise QfolioError("A backtest needs at least one agent; name some (--agents).")
-        preset = all(isinstance(agent, Preset) for agent in agents.values())
-        if preset and (episodes is not None or task):
-            raise QfolioError(
-                "episodes and task are for agents without a preset; change those of a preset with "
-                "preset._replace(episodes=…, task=…)."
-            )
-        require_list("baselines", baselines, str, "a list of names")
-        require_type("cap", cap, Real, "a number")
-        if not 0 < cap <= 1:
-            raise QfolioError(
-                f"The cap is {cap:g}; it must be above 0 and at most 1. A mandate that allows "
-                "loans or short sales may set one above 1 (assets.cap)."
-            )
         prices = load(prices)
         terms = TradingTerms.of(mandate, cost, cost_model, calendar, benchmark)
         field = field_of(prices, agents, baselines, strategies or {}, terms.benchmark)
@@ -208,7 +194,7 @@ class Backtest:
         if limits is not None:
             limits = tracked(limits, terms.benchmark, field, prices)
         rows = fewest(walk_forward(prices.dates, train, test, int(lag), expanding), prices)
-        require_tested(prices.dates, train, 2)  # for statistics
+        require_tested(prices.dates, train, SHORTEST)
         config = BacktestConfig(
             prices=describe(prices),
             assets=list(prices.assets),
@@ -242,12 +228,7 @@ class Backtest:
             checks.require(mandate_text(config.mandate, prices.assets), every, config.cap)
         given = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
         backtest = cls(prices, config, None, given, field.own)
-        if config.mandate is not None:
-            checks.require_safe(backtest.replay.task.mandate, backtest.replay.starts(), config.cap)
-        backtest._plan.require_able()
-        for name, each in backtest.baselines.items():
-            if own_modules(each):  # its faults would otherwise show only after all training
-                backtest.replay.try_out(name, each)
+        backtest._require_able()
         if place is not None:
             with new_folder(place) as folder:
                 BacktestFolder(folder).write(config, prices, field.own)
@@ -489,6 +470,15 @@ class Backtest:
         bound = constant_bound(self.replay.growth[days], table.periods_per_year)
         return dataclasses.replace(assessed, bound=bound)
 
+    def _require_able(self) -> None:
+        """Raises QfolioError if orders or agents fail, which would show only after all training."""
+        if self.config.mandate is not None:
+            checks.require_safe(self.replay.task.mandate, self.replay.starts(), self.config.cap)
+        self._plan.require_able()
+        for name, each in self.baselines.items():
+            if own_modules(each):
+                self.replay.try_out(name, each)
+
     def _name(self, agent: str | None) -> str:
         """An agent's name (default: the first); raises QfolioError if it is unknown."""
         name = next(iter(self.agents)) if agent is None else agent
@@ -497,8 +487,15 @@ class Backtest:
         return name
 
 
-def _require_types(agents: object, strategies: object, **numbers: object) -> None:
-    """Raises QfolioError for agents, strategies or whole numbers of another type."""
+def _require_arguments(
+    agents: object,
+    strategies: object,
+    baselines: object,
+    task: object,
+    episodes: int | None,
+    cap: Any,
+) -> None:
+    """Raises QfolioError for arguments of ``Backtest.create`` that no table could make right."""
     one = 'qfolio.preset("fast", "portfolio", "tilts")'
     by_name = f'presets or agents by name, such as {{"tilts": {one}}}'
     require_type("agents", agents, Mapping, f"a dictionary of {by_name}")
@@ -509,5 +506,20 @@ def _require_types(agents: object, strategies: object, **numbers: object) -> Non
     if strategies is not None:
         wanted = 'a dictionary of files or tables by name, such as {"mine": "mine.csv"}'
         require_type("strategies", strategies, Mapping, wanted)
-    for name, number in numbers.items():
-        require_type(name, number, Integral, "a whole number")
+    if task is not None:
+        require_type("task", task, Mapping, 'a dictionary of settings, such as {"window": 20}')
+    if not agents:
+        raise QfolioError("A backtest needs at least one agent; name some (--agents).")
+    preset = all(isinstance(agent, Preset) for agent in agents.values())
+    if preset and (episodes is not None or task):
+        raise QfolioError(
+            "episodes and task are for agents without a preset; change those of a preset with "
+            "preset._replace(episodes=…, task=…)."
+        )
+    require_list("baselines", baselines, str, "a list of names")
+    require_type("cap", cap, Real, "a number")
+    if not 0 < cap <= 1:
+        raise QfolioError(
+            f"The cap is {cap:g}; it must be above 0 and at most 1. A mandate that allows "
+            "loans or short sales may set one above 1 (assets.cap)."
+        )

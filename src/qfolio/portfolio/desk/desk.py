@@ -2,6 +2,7 @@
 
 import datetime
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -10,29 +11,27 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.files import path_of
 from qfolio.core.registry import again
-from qfolio.core.text import amount, listed, near, quote
+from qfolio.core.text import amount, near, quote
 from qfolio.core.version import __version__
-from qfolio.portfolio import anchors
-from qfolio.portfolio.backtest.baselines import baseline
-from qfolio.portfolio.backtest.baselines.base import window_rows
 from qfolio.portfolio.backtest.folder import BacktestFolder
-from qfolio.portfolio.backtest.folds import latest
 from qfolio.portfolio.backtest.own import Own
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.calendars import band, decision_rows
-from qfolio.portfolio.desk.allocation import NOISE, Allocation
-from qfolio.portfolio.desk.holdings import cashed_out
+from qfolio.portfolio.desk import notes
+from qfolio.portfolio.desk.allocated import Allocated
+from qfolio.portfolio.desk.allocation import Allocation, require_fresh
+from qfolio.portfolio.desk.drivers import reasons, sentence
+from qfolio.portfolio.desk.holdings import cashed_out, read_holdings
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
-from qfolio.portfolio.desk.standing import Kind
+from qfolio.portfolio.desk.orders_csv import order_rows, replaced
+from qfolio.portfolio.desk.standing import Kind, Standing
 from qfolio.portfolio.desk.untrained import Ordered, Rule, Untrained
-from qfolio.portfolio.policy import UNKNOWN, Policy
-from qfolio.portfolio.prices.findings import Finding, day, first_of
-from qfolio.portfolio.prices.frequency import require_alike, spacing
+from qfolio.portfolio.mandate.limits import lots
+from qfolio.portfolio.policy import Policy
+from qfolio.portfolio.prices.findings import Finding, day
+from qfolio.portfolio.prices.frequency import require_alike
 from qfolio.portfolio.prices.table import Prices, accepted, inspect
-
-SLOW = 6.0
-"""Days between the rows of a table from which on a lag of one is no longer the next day."""
 
 LATE = 5
 """Last rows without a price that may only be late; of more, an asset may be said to be delisted."""
@@ -126,7 +125,7 @@ class Desk:
             cap=config.cap,
         )
 
-    def table(self, followed: Policy | Untrained, prices: Path | None) -> Prices:
+    def table(self, followed: Policy | Untrained, prices: Any) -> Prices:
         """The prices to decide on (default: those of the backtest).
 
         Raises QfolioError, also if no asset may be held at their last row.
@@ -141,7 +140,7 @@ class Desk:
             )
         return followed.table(table)
 
-    def read(self, prices: Path | None) -> Prices:
+    def read(self, prices: Any) -> Prices:
         """The latest prices of the backtest's assets (default: those of the backtest).
 
         Raises:
@@ -150,8 +149,9 @@ class Desk:
         """
         if prices is None:
             return self.run.prices
-        read, self.findings = self.inspect(prices)
-        table = accepted(read, self.findings, prices)
+        read, findings = self.inspect(prices)
+        table = accepted(read, findings, prices)
+        self.findings = findings
         if table.members is None and self.run.prices.members is not None:
             raise QfolioError(
                 "The backtest's universe has members that change over time; give the latest "
@@ -162,8 +162,8 @@ class Desk:
             gone = np.flatnonzero(~known.listed[-1] & ~np.isin(known.assets, table.assets)).tolist()
             if gone:
                 raise QfolioError(
-                    f"The price table lacks {_with_ends(known, gone)}, delisted in the backtest; "
-                    "give prices that begin earlier, as the backtest's do."
+                    f"The price table lacks {notes.with_ends(known, gone)}, delisted in the "
+                    "backtest; give prices that begin earlier, as the backtest's do."
                 )
         table = table.exactly(known.assets, "the backtest")
         require_alike(table.dates, known.periods_per_year, "the backtest has")
@@ -176,9 +176,9 @@ class Desk:
         late = [] if listed is None else [j for j in ended if listed[-1 - LATE :, j].any()]
         if late and not self.delists:
             raise QfolioError(
-                f"The prices end on {day(table.dates[-1])}, but those of {_with_ends(table, late)} "
-                "end earlier; fetch them again or, if the assets were delisted, add --ended "
-                "cash-out."
+                f"The prices end on {day(table.dates[-1])}, but those of "
+                f"{notes.with_ends(table, late)} end earlier; fetch them again or, if the assets "
+                "were delisted, add --ended cash-out."
             )
 
     def _ended(self, table: Prices) -> list[int]:
@@ -195,15 +195,90 @@ class Desk:
         last = day(self.run.prices.dates[-1])
         return [found for found in self.findings if found.date and found.date > last]
 
-    def hindsight(self, followed: Policy | Untrained, table: Prices) -> str:
-        """Says so if a policy has learned from later rows than a table's last one; else ""."""
-        last = table.dates[-1]
-        if not isinstance(followed, Policy) or not followed.learned > last:
-            return ""
-        return (
-            f"The policy has learned from prices up to {day(followed.learned)}, which were not "
-            f"known on {day(last)}"
+    def allocate(
+        self,
+        agent: str | None = None,
+        prices: Any = None,
+        holdings: Path | str | None = None,
+        capital: float | None = None,
+        *,
+        anyway: bool = False,
+        whole_shares: bool = False,
+        as_of: str | None = None,
+        update: bool = False,
+        orders: Path | str | None = None,
+        layout: str = "generic",
+        currency: str = "USD",
+        dry_run: bool = False,
+    ) -> Allocated:
+        """Tomorrow's trades, which the ledger records.
+
+        If anything fails, the ledger, the policies and the file of orders stay as they were.
+
+        Args:
+            agent, holdings, capital, anyway, whole_shares, as_of, update, orders, layout, currency,
+                dry_run: As the options of ``qfolio allocate``.
+            prices: Anything that ``qfolio.load_prices`` reads (default: those of the backtest).
+
+        Raises:
+            QfolioError: The backtest advises against the agent, an input does not fit, or the
+                policy has learned from later prices.
+        """
+        name = next(iter(self.run.agents)) if agent is None else agent
+        standing = Standing.of(self.folder, name, self.kind(name))
+        if not anyway:
+            standing.require_sound(self.resume, named=agent is not None)
+        followed = self.followed(name)
+        table = self.table(followed, prices)
+        if table.levels:
+            in_shares = whole_shares or holdings is not None or orders is not None
+            _require_weights_alone(followed, in_shares)
+        require_fresh(table, as_of)
+        source = None if holdings is None else path_of("holdings", holdings)
+        held = read_holdings(source, table.assets, capital, debts=self.debts)
+        shares, cash, said = cashed_out(*held, table)
+        updated = None
+        if update:
+            if not isinstance(followed, Policy):
+                raise QfolioError(f"{name} learns nothing; leave out --update.")
+            followed = updated = followed.update(table)
+        hindsight = notes.hindsight(followed, table)
+        if hindsight and not anyway:
+            raise QfolioError(
+                f"{hindsight}; give later prices, or add --anyway, which then records nothing."
+            )
+        spent = self.spent(followed, table)
+        allocation = Allocation.of(
+            followed,
+            table,
+            shares,
+            cash,
+            whole_shares=whole_shares,
+            spent=spent,
+            debts=self.debts,
         )
+        wanted = None
+        if orders is not None:
+            wanted = path_of("orders", orders), *order_rows(allocation, layout, currency)
+        trained, why = None, None
+        if isinstance(followed, Policy):
+            trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
+            why = reasons(followed, table, allocation, spent)
+            said = [*(f"Why {sentence(reason)}" for reason in why), *said]
+        else:
+            said = [*said, *followed.notes(table, allocation.held, spent=spent)]
+        said += self.terms(followed, table, allocation, spent)
+        record, done = None, "A dry run: nothing is written."
+        if not dry_run:
+            with nullcontext() if wanted is None else replaced(*wanted):
+                if hindsight:
+                    done = f"{hindsight}, so that nothing is recorded."
+                else:
+                    record, done = self.record(name, allocation, table, whole_shares, updated)
+            if wanted is not None:
+                done += f" {wanted[0]} has {amount(len(wanted[-1]), 'order')}."
+        said.append(done)
+        return Allocated(allocation, standing, trained, table, spent, why, said, record)
 
     def fill(self, name: str) -> int:
         """Rows over which orders are filled: those of the user's own strategies at once."""
@@ -238,126 +313,70 @@ class Desk:
         self, followed: Policy | Untrained, table: Prices, allocation: Allocation, spent: float
     ) -> list[str]:
         """Sentences on when and how the backtest and its mandate would trade an allocation."""
+        known, config = self.run.prices, self.run.config
         trading = followed.task.written.trading
-        given = followed, table, allocation
-        said = [*self._doubts(*given), *self._timing(*given)]
+        earlier = [each for each in self.ledger.current() if each.moment < table.dates[-1]]
+        said = [
+            *notes.ended(table, self._ended(table)),
+            *notes.too_short(followed, table, known),
+            *notes.not_traded(allocation, earlier),
+        ]
+        # The first allocation is due at any row, as in the backtest, and strategies of the user's
+        # own have their own dates.
+        free = not earlier or isinstance(followed, Ordered)
+        due = free or followed.task.terms.calls(allocation.held)
+        idle = notes.nothing_ordered(allocation, config.calendar)
+        said += idle or ([] if due else notes.not_due(config.calendar, table, known))
         if allocation.trades.any():
-            said += [*waiting(table, self.run.config.lag), *self._pending(table)]
-        if trading.fill > 1:
-            said.append(
-                f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
-                "order at each of these rows. The expected cost assumes a single trade; fees per "
-                "trade and market impact will differ."
-            )
-        if (most := trading.turnover_a_year) is not None:
-            said.append(
-                f"The mandate allows a turnover of {most:.0%} a year: the ledger's orders have "
-                f"used {spent:.1%} this year, and this one uses {allocation.turnover:.1%}."
-            )
-        return said
-
-    def _doubts(
-        self, followed: Policy | Untrained, table: Prices, allocation: Allocation
-    ) -> Iterator[str]:
-        """What an order rests on and the user may know better."""
-        if ended := self._ended(table):
-            yield f"These assets count as delisted since the backtest: {_with_ends(table, ended)}."
-        dates = self.run.prices.dates
-        known = np.concatenate([dates[dates < table.dates[0]], table.dates])
-        late = UNKNOWN
-        # Where assets come and go, a rule without estimates may hold each from its first price on.
-        if table.tradable is None or (isinstance(followed, Rule) and followed.baseline.estimates):
-            before = self.run.prices
-            late = before.dates[min(int(before.first_rows.max()), len(before) - 1)]
-        what, rows = lookback(followed, known, table.month, late)
-        if rows > len(table):
-            yield (
-                f"The prices begin on {day(table.dates[0])}, but {what} looks back to "
-                f"{day(known[-rows])}; give them from there on, as the backtest has them, or the "
-                "orders may differ from those that it would give."
-            )
-        records = [record for record in self.ledger.current() if record.moment < table.dates[-1]]
-        # Cash may have earned interest since, or paid a fee.
-        same = records and np.allclose(allocation.shares, records[-1].shares, rtol=1e-9, atol=1e-5)
-        if same and any(records[-1].trades):
-            yield (
-                f"The holdings are those of record {records[-1].number} before its trades; if "
-                "these were filled, export the holdings again."
-            )
-
-    def _pending(self, table: Prices) -> list[str]:
-        """Says so if parts of earlier orders are filled between the last row and its trade."""
-        last, lag = len(table) - 1, self.run.config.lag
-        if lag < 2:
-            return []
-        records = [record for record in self.ledger.current() if any(record.trades)]
-        moments = np.array([record.moment for record in records], table.dates.dtype)
-        rows = np.searchsorted(table.dates, moments)
-        fills = np.array([self.fill(record.agent) for record in records], int)
-        pending = (rows < last) & (last < rows + lag + fills - 1)
-        dates = [record.date for record, yes in zip(records, pending, strict=True) if yes]
-        if not dates:
-            return []
-        return [
-            f"With the backtest's lag of {lag} rows, the orders of {listed(dates)} are not filled "
-            "yet; if the holdings do not contain them, the same trades are ordered again."
-        ]
-
-    def _timing(
-        self, followed: Policy | Untrained, table: Prices, allocation: Allocation
-    ) -> list[str]:
-        """Says so if the backtest's calendar has no order at a table's last row.
-
-        The first allocation is due at any row, as in the backtest, and strategies of the user's own
-        have their own dates.
-        """
-        terms, calendar = followed.task.terms, self.run.config.calendar
-        days, within = table.dates, band(calendar)
-        if not allocation.trades.any():
-            if abs(allocation.weights - allocation.held)[1:].max() > NOISE:
-                return [
-                    "Nothing is ordered: every trade is less than a whole share or lot, or costs "
-                    "more than it moves."
-                ]
-            if within:
-                far = f"no weight is more than {within:g} from what is wanted"
-                return [f"Nothing is ordered: {far}."]
-        started = any(record.moment < days[-1] for record in self.ledger.current())
-        if not started or isinstance(followed, Ordered) or terms.calls(allocation.held):
-            return []
-        if calendar.isdecimal() and days[0] != self.run.prices.dates[0]:
-            return []  # rows are counted from the first one of the backtest
-        due = decision_rows(calendar, days)
-        if due[-1]:
-            return []
-        often = f"every {calendar} rows" if calendar.isdecimal() else calendar
-        return [
-            f"The backtest decides {often}, and would not on {day(days[-1])}; its latest decision "
-            f"was due on {day(days[due][-1])}."
-        ]
+            fills = [self.fill(record.agent) for record in earlier]
+            said += notes.waiting(table, config.lag)
+            said += notes.pending(table, config.lag, earlier, fills)
+        said += notes.filled_over(trading.fill)
+        return said + notes.budget(trading.turnover_a_year, spent, allocation)
 
     def record(
-        self, name: str, allocation: Allocation, prices: Prices, whole_shares: bool
+        self,
+        name: str,
+        allocation: Allocation,
+        prices: Prices,
+        whole_shares: bool,
+        updated: Policy | None = None,
     ) -> tuple[Record, str]:
         """Appends an allocation by the newest policy of an agent, or by another strategy.
 
+        updated: the policy that becomes the agent's newest with this record.
+
         Returns the record, and a sentence that says what was done.
         """
-        learned = name in self.run.agents
-        stored = self.run.newest(name) if learned else None
         held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
-        digests = {"prices": prices.sha256, "holdings": held, **self._digests(name, stored)}
-        return self.ledger.append(
-            allocation,
-            prices,
-            keep_prices=prices.sha256 != self.run.prices.sha256,
-            agent=name,
-            policy=stored,
-            digests=digests,
-            whole_shares=whole_shares,
-            made=datetime.datetime.now().astimezone().isoformat(" ", "seconds"),
-            version=__version__,
-        )
+        with nullcontext() if updated is None else self._keeping(name, updated):
+            stored = self.run.newest(name) if name in self.run.agents else None
+            digests = {"prices": prices.sha256, "holdings": held, **self._digests(name, stored)}
+            return self.ledger.append(
+                allocation,
+                prices,
+                keep_prices=prices.sha256 != self.run.prices.sha256,
+                agent=name,
+                policy=stored,
+                digests=digests,
+                whole_shares=whole_shares,
+                made=datetime.datetime.now().astimezone().isoformat(" ", "seconds"),
+                version=__version__,
+            )
+
+    @contextmanager
+    def _keeping(self, name: str, updated: Policy) -> Iterator[None]:
+        """Stores an updated policy for a block; it goes if the block fails.
+
+        Otherwise the next try would find that the policy has already learned from the new rows.
+        """
+        self.run.keep(name, updated)
+        try:
+            yield
+        except BaseException:
+            stored = BacktestFolder(self.folder).policy_file(name, self.run.newest(name))
+            stored.unlink(missing_ok=True)
+            raise
 
     def reproduce(
         self,
@@ -427,50 +446,15 @@ class Desk:
         return found
 
 
-def lookback(
-    followed: Policy | Untrained, dates: np.ndarray, month: int, late: np.datetime64 = UNKNOWN
-) -> tuple[str, int]:
-    """What of a strategy looks back on most rows of a table, and on how many.
-
-    A policy's signals are not counted: it needs the rows that they look back on.
-
-    late: date of the first price of the last asset to start. A baseline holds an asset once it has
-    prices in all of the training window, and cannot tell where these begin later.
-    """
-    found = {"": 0}
-    task = followed.task
-    if isinstance(followed, Rule):
-        fold, rows = latest("", dates, followed.train, followed.expanding), 0
-        if followed.baseline.estimates:
-            months, least = followed.baseline.months, followed.baseline.least
-            window = len(dates) if months is None else window_rows(months, least, month)
-            rows = min(window, fold.train.stop - fold.train.start)
-        if late > dates[fold.recent.start]:
-            rows = max(rows, fold.recent.stop - fold.recent.start)
-        found[followed.name] = rows
-    if any(baseline(name).estimates for name in anchors.baselines(task.anchor)):
-        found["the agent's anchor"] = (anchors.MONTHS + 1) * month  # it decides once a month
-    risk = task.written.risk
-    limited = risk.volatility is not None or risk.tracking_error is not None
-    if limited and not isinstance(followed, Ordered):
-        found["the mandate's limit on risk"] = risk.rows + 1
-    what = max(found, key=found.__getitem__)
-    return what, min(found[what], len(dates))
-
-
-def _with_ends(table: Prices, which: list[int]) -> str:
-    """Assets that ended, each with the date of its last price."""
-    assert table.listed is not None
-    ends = {j: table.dates[np.flatnonzero(table.listed[:, j])[-1]] for j in which}
-    return first_of(f"{table.assets[j]} ({day(end)})" for j, end in ends.items())
-
-
-def waiting(prices: Prices, lag: int) -> list[str]:
-    """Says so if orders wait for long, because the rows of a table are far apart."""
-    usual = spacing(prices.dates)[1] if len(prices) > 1 else 0.0
-    if not lag or usual < SLOW:
-        return []
-    return [
-        f"The backtest and follow fill these orders {amount(lag, 'row')} later, after about "
-        f"{lag * usual:.0f} days; if you trade at once, allocate from a backtest with --lag 0."
-    ]
+def _require_weights_alone(followed: Policy | Untrained, in_shares: bool) -> None:
+    """Raises QfolioError if shares are asked for, or lots, of which returns give no prices."""
+    if in_shares:
+        raise QfolioError(
+            "Returns give no share prices; leave out --holdings, --whole-shares and --orders, or "
+            "give a table of prices (--prices, without --returns)."
+        )
+    if lots(followed.mandate) is not None:
+        raise QfolioError(
+            "The mandate has lots, but returns give no share prices; give a table of prices "
+            "(--prices, without --returns)."
+        )

@@ -2,12 +2,15 @@
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.files import UNFINISHED, naming, write_csv
 from qfolio.core.text import near, quote
 from qfolio.portfolio.desk.allocation import Allocation
 
@@ -31,6 +34,29 @@ def order_rows(allocation: Allocation, layout: str, currency: str) -> tuple[list
     if layout not in LAYOUTS:
         raise QfolioError(f"--layout is {quote(layout)}; {near(layout, LAYOUTS)}")
     return LAYOUTS[layout](allocation, currency)
+
+
+@contextmanager
+def replaced(path: Path, header: list[str], rows: Rows) -> Iterator[None]:
+    """Writes orders beside ``path`` before a block, which records them, and renames them after it.
+
+    So nothing is recorded that cannot be written, and if the block fails, an earlier file stays.
+
+    Raises QfolioError if the path is a folder.
+    """
+    if path.is_dir():
+        raise QfolioError(f"{path} is a folder; name a file.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}{UNFINISHED}")
+    try:
+        with naming(path):
+            write_csv(temporary, header, rows)
+        yield
+        with naming(path):
+            temporary.replace(path)
+    finally:
+        with suppress(OSError):  # on a disk that has become read-only
+            temporary.unlink(missing_ok=True)
 
 
 def _generic(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:

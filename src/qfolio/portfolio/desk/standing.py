@@ -8,6 +8,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json
 from qfolio.core.text import figure, shell
 from qfolio.portfolio.backtest.folder import followed
+from qfolio.portfolio.backtest.statistics.verdict import seeds_lost
 
 Kind = Literal["agent", "baseline", "strategy"]
 
@@ -45,7 +46,7 @@ class Standing:
                 measured = _measured(kind, strategies[agent]["measures"])
                 return Standing(agent, measured, False, kind)
             name = followed(agent, strategies)
-            lost = -1 in strategies[name]["measures"]["growth"]["per_seed"]
+            lost = seeds_lost(strategies[name]["measures"]["drawdown"]["per_seed"]) > 0
             worse = any(
                 strategies[name][key] is not None
                 and strategies[name][key]["growth"]["finding"] == "worse"

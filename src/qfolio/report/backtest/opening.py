@@ -92,9 +92,11 @@ def conclusion(data: BacktestData) -> str:
     def which(key: Measured, *found: Standing) -> list[str]:
         return [name for name in names if standing(name, key, test) in found]
 
-    def told(subject: str) -> str:
-        who, other = "it" if subject == lead else lead, difference.reference
-        own, theirs = (test.strategies[name].measures["growth"].mean for name in (lead, other))
+    def told(agents: list[str]) -> str:
+        """How much one of some agents grew: the one at the top of the page, if it is of them."""
+        agent = lead if lead in agents else agents[0]
+        who, other = "it" if agents == [agent] else agent, against(agent, test).reference
+        own, theirs = (test.strategies[name].measures["growth"].mean for name in (agent, other))
         return (
             f"{who} grew {percent(own)} a year after costs, against {percent(theirs)} for {other}"
         )
@@ -103,21 +105,20 @@ def conclusion(data: BacktestData) -> str:
         verb = "beats" if len(winners) == 1 else "beat"
         also = " and Sharpe ratio" if winners == which("sharpe", "better") else ""
         other = _others(winners, test, better=True)
-        return f"{listed(winners)} {verb} {other} in growth{also}: {told(listed(winners))}."
+        return f"{listed(winners)} {verb} {other} in growth{also}: {told(winners)}."
     if winners := which("sharpe", "better"):
         verb = "beats" if len(winners) == 1 else "beat"
         than = _others(winners, test, better=True)
         clearly = "" if set(winners) & set(which("growth", "worse", "ruined")) else "clearly "
         return (
             f"{listed(winners)} {verb} {than} in return for the risk, but not {clearly}in growth: "
-            f"{told(listed(winners))}."
+            f"{told(winners)}."
         )
-    subject = lead if len(names) == 1 else ""
     if len(which("growth", "worse", "ruined")) == len(names):
         who = f"{lead} falls" if len(names) == 1 else "All agents fall"
-        return f"{who} short of {_others(names, test)}: {told(subject)}."
+        return f"{who} short of {_others(names, test)}: {told(names)}."
     who = f"{lead} does not clearly beat" if len(names) == 1 else "No agent clearly beats"
-    return f"{who} {_others([lead], test)}: {told(subject)}."
+    return f"{who} {_others([lead], test)}: {told(names)}."
 
 
 def _others(names: list[str], test: Assessment, better: bool = False) -> str:

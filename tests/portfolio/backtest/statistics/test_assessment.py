@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.statistics.assessment import Strategy, assess
+from qfolio.portfolio.backtest.statistics.assessment import Strategy
 from qfolio.portfolio.backtest.statistics.bootstrap import block_length
 from qfolio.portfolio.backtest.statistics.measures import MEASURES, measures
 from qfolio.portfolio.backtest.statistics.sharpe import (
@@ -17,7 +17,7 @@ from qfolio.portfolio.backtest.statistics.sharpe import (
     probabilistic_sharpe,
 )
 
-from records import record, strategy
+from records import assessed, record, strategy
 from tables import days
 
 
@@ -29,7 +29,7 @@ def test_assess_by_hand_on_one_block() -> None:
     strong = strong._replace(returns=np.asarray(strong.returns) + 0.01)
     everything = {"equal weight": weak, "strong": strong, "dqn": agent}
     dates = days(300, "2001-01-01")
-    result = assess(everything, dates, periods_per_year=252, earlier_trials=2)
+    result = assessed(everything, dates, earlier_trials=2)
     table = measures(*record(agent), 252)
     dqn = result.strategies["dqn"]
     assert result.best_baseline == "strong"
@@ -92,7 +92,7 @@ def test_a_market_that_rose_is_no_skill() -> None:
         "equal weight": base._replace(returns=returns),
         "dqn": strategy(rng)._replace(returns=returns + 0.001 * noise),
     }
-    result = assess(entries, days(300), periods_per_year=252, resamples=10, earlier_trials=10)
+    result = assessed(entries, days(300), resamples=10, earlier_trials=10)
     test, active = result.strategies["dqn"].sharpe_test, result.strategies["dqn"].active_test
     assert active is not None
     assert result.strategies["equal weight"].active_test is None
@@ -108,10 +108,7 @@ def test_skewness_and_kurtosis_by_hand() -> None:
     # One day of +3 among three of −1: variance 3, third moment 6, fourth 21.
     returns = np.tile([[0.03, -0.01, -0.01, -0.01]], 5)
     zeros = np.zeros((1, 20))
-    result = assess(
-        {"equal weight": ("baseline", returns, zeros, zeros)}, days(20), periods_per_year=252,
-        resamples=10,
-    )  # fmt: skip
+    result = assessed({"equal weight": ("baseline", returns, zeros, zeros)}, days(20), resamples=10)
     test = result.strategies["equal weight"].sharpe_test
     assert test.skewness == pytest.approx(6 / 3**1.5)
     assert test.kurtosis == pytest.approx(21 / 9)
@@ -126,8 +123,7 @@ def test_order_of_seeds_changes_nothing() -> None:
     order = [3, 0, 4, 2, 1]
     shuffled = Strategy("agent", *(np.asarray(values)[order] for values in agent[1:]))
     first, second = (
-        assess({"equal weight": base, "dqn": entry}, days(300), periods_per_year=252)
-        for entry in (agent, shuffled)
+        assessed({"equal weight": base, "dqn": entry}, days(300)) for entry in (agent, shuffled)
     )
     one, two = ({**x.measures, **x.relative} for x in
                 (first.strategies["dqn"], second.strategies["dqn"]))  # fmt: skip
@@ -146,7 +142,7 @@ def test_block_length_listens_to_the_size_of_moves() -> None:
     returns = 0.01 * (size * rng.choice([-1, 1], 1200))[None]
     zeros = np.zeros_like(returns)
     entry = ("baseline", returns, zeros, zeros)
-    result = assess({"equal weight": entry}, days(1200), periods_per_year=252, resamples=10)
+    result = assessed({"equal weight": entry}, days(1200), resamples=10)
     assert result.block_length > 15 > 2 * block_length(returns[0])
 
 
@@ -160,7 +156,7 @@ def test_many_trials_raise_the_threshold_however_alike_the_seeds_are() -> None:
         cost=np.repeat(record(one)[2], 5, 0),
     )
     strategies = {"equal weight": strategy(rng, "baseline", 1), "dqn": alike}
-    result = assess(strategies, days(300), periods_per_year=252, earlier_trials=1000)
+    result = assessed(strategies, days(300), earlier_trials=1000)
     threshold = result.strategies["dqn"].sharpe_test.threshold
     assert threshold == pytest.approx(math.sqrt(252) * expected_maximum_sharpe(1005, 1 / 299))
     assert threshold > 2
@@ -169,10 +165,10 @@ def test_many_trials_raise_the_threshold_however_alike_the_seeds_are() -> None:
 def test_trials_without_a_known_spread() -> None:
     rng = np.random.default_rng(15)
     strategies = {"equal weight": strategy(rng, "baseline", 1), "dqn": strategy(rng, seeds=1)}
-    result = assess(strategies, days(300), periods_per_year=252, earlier_trials=9)
+    result = assessed(strategies, days(300), earlier_trials=9)
     threshold = result.strategies["dqn"].sharpe_test.threshold
     assert threshold == pytest.approx(math.sqrt(252) * expected_maximum_sharpe(10, 1 / 299))
-    result = assess(strategies, days(300), periods_per_year=252)
+    result = assessed(strategies, days(300))
     assert result.trials == 1
     assert result.strategies["dqn"].sharpe_test.threshold == 0
 
@@ -190,7 +186,7 @@ def test_json_of_the_worst() -> None:
         "gains": ("agent", gains, zeros, zeros),
         "mixed": ("agent", mixed, zeros, zeros),
     }
-    result = assess(strategies, days(30), periods_per_year=252)
+    result = assessed(strategies, days(30))
     content = json.loads(json.dumps(result.to_json(), allow_nan=False))
     ruined = content["strategies"]["ruin"]
     assert ruined["measures"]["growth"]["mean"] == -1
@@ -211,8 +207,7 @@ def test_assess_is_repeatable_and_its_seed_counts() -> None:
     rng = np.random.default_rng(16)
     strategies = {"equal weight": strategy(rng, "baseline", 1), "dqn": strategy(rng)}
     first, second, third = (
-        assess(strategies, days(300), periods_per_year=252, resamples=200, seed=seed)
-        for seed in (0, 0, 1)
+        assessed(strategies, days(300), resamples=200, seed=seed) for seed in (0, 0, 1)
     )
     assert first.to_json() == second.to_json() != third.to_json()
     assert first.to_json()["strategies"]["dqn"]["seeds"] == 3
@@ -223,7 +218,7 @@ def test_few_seeds_have_no_interval() -> None:
     rng = np.random.default_rng(9)
     base = strategy(rng, "baseline", 1)
     entries = {"equal weight": base, "four": strategy(rng, seeds=4), "five": strategy(rng, seeds=5)}
-    result = assess(entries, days(300), periods_per_year=252, resamples=10)
+    result = assessed(entries, days(300), resamples=10)
     assert result.strategies["four"].measures["growth"].over_seeds is None
     assert len(result.strategies["four"].measures["growth"].per_seed) == 4
     assert result.strategies["five"].measures["growth"].over_seeds is not None
@@ -260,4 +255,4 @@ def test_assess_refuses(
     strategies: dict[str, object], options: dict[str, object], message: str
 ) -> None:
     with pytest.raises(QfolioError, match=message):
-        assess(strategies, **{"dates": days(4), "periods_per_year": 252.0} | options)  # type: ignore[arg-type]
+        assessed(strategies, **{"dates": days(4)} | options)  # type: ignore[arg-type]

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from qfolio.core.statistics import holm
-from qfolio.portfolio.backtest.statistics.assessment import Assessment, Strategy, assess
+from qfolio.portfolio.backtest.statistics.assessment import Assessment, Strategy
 from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference, tails_to
 from qfolio.portfolio.backtest.statistics.estimates import Estimate, Tails
 
-from records import strategy
+from records import assessed, strategy
 from tables import days
 
 NU = 400
@@ -93,8 +93,7 @@ def test_holm_takes_away_what_many_comparisons_found_by_luck() -> None:
         for i in range(5)
     }
     alone, among = (
-        assess({"equal weight": base, "edge": edge, **more}, days(300), periods_per_year=252)
-        for more in ({}, noise)
+        assessed({"equal weight": base, "edge": edge, **more}, days(300)) for more in ({}, noise)
     )
     (single,), (one,) = both(alone, "edge"), both(among, "edge")
     assert alone.comparisons == 3  # measures
@@ -126,9 +125,7 @@ def test_earlier_trials_weaken_claims_to_be_better() -> None:
     }
 
     def growth(trials: int) -> list[Contrast]:
-        result = assess(
-            entries, days(300), periods_per_year=252, resamples=100, earlier_trials=trials
-        )
+        result = assessed(entries, days(300), resamples=100, earlier_trials=trials)
         return [both(result, name)[0].growth for name in ("up", "down")]
 
     (up_alone, down_alone), (up_among, down_among) = growth(0), growth(20)
@@ -148,7 +145,7 @@ def test_the_best_are_those_with_the_most_growth_and_the_highest_sharpe_ratio() 
     bold = Strategy("baseline", 0.0010 + 0.010 * wave, zeros, zeros)
     cash = Strategy("baseline", zeros, zeros, zeros)
     entries = {"equal weight": cash, "calm": calm, "bold": bold, "dqn": strategy(rng)}
-    result = assess(entries, days(300), periods_per_year=252, resamples=100)
+    result = assessed(entries, days(300), resamples=100)
     sharpes = {name: entry.measures["sharpe"].mean for name, entry in result.strategies.items()}
     assert sharpes["calm"] > sharpes["bold"]
     assert (result.best_baseline, result.best_sharpe) == ("bold", "calm")
@@ -163,7 +160,7 @@ def test_the_best_are_those_with_the_most_growth_and_the_highest_sharpe_ratio() 
     assert in_tests(result, "calm", "bold") == []
     # One baseline that is the best in both is compared in both.
     del entries["bold"]
-    result = assess(entries, days(300), periods_per_year=252, resamples=100)
+    result = assessed(entries, days(300), resamples=100)
     assert result.best_baseline == result.best_sharpe == "calm"
     assert result.comparisons == 3 + 2
     assert result.strategies["dqn"].to_best_sharpe is None
@@ -174,7 +171,7 @@ def test_the_reference_as_the_best_is_one_comparison() -> None:
     base = strategy(rng, "baseline", 1)
     weak = base._replace(returns=np.asarray(base.returns) - 0.01)
     entries = {"equal weight": base, "weak": weak, "dqn": strategy(rng)}
-    result = assess(entries, days(300), periods_per_year=252, resamples=100)
+    result = assessed(entries, days(300), resamples=100)
     assert result.best_baseline == "equal weight"
     assert result.comparisons == 3
     assert result.strategies["dqn"].to_best_baseline is None
@@ -184,7 +181,7 @@ def test_a_strategy_does_not_differ_from_itself() -> None:
     rng = np.random.default_rng(11)
     base = strategy(rng, "baseline", 1)
     copies = {"equal weight": base, "dqn": base._replace(kind="agent"), "noise": strategy(rng)}
-    (difference,) = both(assess(copies, days(300), periods_per_year=252), "dqn")
+    (difference,) = both(assessed(copies, days(300)), "dqn")
     for contrast in difference.contrasts().values():
         assert contrast.value == 0
         assert contrast.interval == (0, 0)
@@ -198,7 +195,7 @@ def test_differences_are_paired() -> None:
     base = strategy(rng, "baseline", 1)
     returns = np.asarray(base.returns)
     agent = Strategy("agent", (1 + returns) * math.exp(1e-4) - 1, base.turnover, base.cost)
-    result = assess({"equal weight": base, "dqn": agent}, days(300), periods_per_year=252)
+    result = assessed({"equal weight": base, "dqn": agent}, days(300))
     (difference,) = both(result, "dqn")
     np.testing.assert_allclose(difference.growth.interval, 0.0252, rtol=1e-9)
     assert difference.growth.p is not None
@@ -215,7 +212,7 @@ def test_differences_carry_the_doubt_about_seeds() -> None:
     extra = np.array([-0.08, -0.03, 0.0, 0.02, 0.04, 0.05])
     returns = (1 + np.asarray(base.returns)) * np.exp(extra / 252)[:, None] - 1
     agent = Strategy("agent", returns, np.zeros((6, 300)), np.zeros((6, 300)))
-    result = assess({"equal weight": base, "dqn": agent}, days(300), periods_per_year=252)
+    result = assessed({"equal weight": base, "dqn": agent}, days(300))
     (difference,) = both(result, "dqn")
     assert difference.growth.value == pytest.approx(0, abs=1e-12)
     width = 2 * 2.570582 * extra.std(ddof=1) / math.sqrt(6)
@@ -233,7 +230,7 @@ def test_the_best_rebalancing_is_the_one_that_grew_most() -> None:
     never = base._replace(kind="rebalancing", returns=market + 1e-4 + 0.004 * wave)
     ours = base._replace(kind="agent", returns=market + 4e-4)
     entries = {"equal weight": base, "slow": slow, "never": never, "dqn": ours}
-    result = assess(entries, days(300), periods_per_year=252, resamples=100)
+    result = assessed(entries, days(300), resamples=100)
     assert result.rebalanced == "slow"
     assert result.best_baseline == "equal weight"  # a rebalancing is no baseline
     assert result.comparisons == 6
@@ -246,7 +243,7 @@ def test_the_best_rebalancing_is_the_one_that_grew_most() -> None:
     assert entry.to_rebalanced.growth.interval[0] > 0  # ahead of the best for sure
     assert entry.to_rebalanced.growth.finding == "none"  # but not of each
     del entries["never"]
-    alone = assess(entries, days(300), periods_per_year=252, resamples=100).strategies["dqn"]
+    alone = assessed(entries, days(300), resamples=100).strategies["dqn"]
     assert alone.to_rebalanced is not None
     assert alone.to_rebalanced.growth.finding == "better"
 
@@ -261,7 +258,7 @@ def test_costs_that_slower_rebalancing_saves_are_no_edge() -> None:
         "slow": Strategy("rebalancing", market - 1e-5, zeros, zeros),
         "noise": Strategy("agent", market + 1e-4 * rng.standard_normal(market.shape), zeros, zeros),
     }
-    noise = assess(entries, days(2000), periods_per_year=252, resamples=50).strategies["noise"]
+    noise = assessed(entries, days(2000), resamples=50).strategies["noise"]
     assert noise.to_reference is not None
     assert noise.to_rebalanced is not None
     assert noise.to_reference.growth.finding == "better"
@@ -269,7 +266,7 @@ def test_costs_that_slower_rebalancing_saves_are_no_edge() -> None:
     entries["noise"] = entries["noise"]._replace(
         returns=np.asarray(entries["noise"].returns) - 1e-5
     )
-    noise = assess(entries, days(2000), periods_per_year=252, resamples=50).strategies["noise"]
+    noise = assessed(entries, days(2000), resamples=50).strategies["noise"]
     assert noise.to_reference is not None
     assert noise.to_rebalanced is not None
     assert noise.to_reference.growth.finding == "better"

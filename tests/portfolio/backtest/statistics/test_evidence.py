@@ -50,6 +50,7 @@ def world(rng: np.random.Generator, cost: float = 0.005) -> Assessment:
         },
         days(ROWS - 2),
         periods_per_year=YEAR,
+        reference="equal weight",
         resamples=1,
     )
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.statistics.assessment import Assessment, assess
+from qfolio.portfolio.backtest.statistics.assessment import Assessment
 from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference
 from qfolio.portfolio.backtest.statistics.verdict import bound_sentence, luck, p_text, verdicts
 
-from records import strategy
+from records import assessed, strategy
 from tables import days
 
 
@@ -23,7 +23,7 @@ def text(sentence: str) -> str:
 def assessment() -> Assessment:
     rng = np.random.default_rng(1)
     baselines = {name: strategy(rng, "baseline", 1) for name in ("equal weight", "other")}
-    return assess({**baselines, "dqn": strategy(rng)}, days(300), periods_per_year=252)
+    return assessed({**baselines, "dqn": strategy(rng)}, days(300))
 
 
 NOTHING = Contrast(0.0, (-0.1, 0.1), 0.5, 1.0, "none")
@@ -169,6 +169,17 @@ def test_digits_tell_an_end_from_zero(assessment: Assessment) -> None:
 UNKNOWN = Contrast(-math.inf, (-math.inf, math.inf), 1.0, 1.0, "none")
 
 
+def test_an_interval_without_ends_is_said_as_such(assessment: Assessment) -> None:
+    """As of a test with very few periods, or of one in which a ratio is all but unknown."""
+    nowhere = Contrast(0.0, (-math.inf, math.inf), 1.0, 1.0, "none")
+    far = dataclasses.replace(nowhere, interval=(-300.0, 300.0))
+    for wide in (nowhere, far):
+        (sentence,) = said(assessment, None, about(growth=nowhere, sharpe=nowhere, volatility=wide))
+        assert "in annual growth from it is 0.0% (95% interval -∞% to +∞%;" in sentence
+        assert "in Sharpe ratio 0.00 (95% interval -∞ to +∞;" in sentence
+        assert "in volatility 0.0% (95% interval -100.0% to +∞%;" in sentence
+
+
 def test_a_total_loss_is_said_without_numbers(assessment: Assessment) -> None:
     entry, lost = assessment.strategies["dqn"], about(growth=UNKNOWN)
 
@@ -191,7 +202,7 @@ def test_what_a_year_would_take_is_not_lost() -> None:
     market = 2e-4 * np.random.default_rng(0).standard_normal((1, 1200))
     zeros = np.zeros_like(market)
     minutes = np.datetime64("2024-01-02T09:31") + np.arange(1200, dtype="m8[m]")
-    found = assess(
+    found = assessed(
         {
             "equal weight": ("baseline", market, zeros, zeros),
             "dqn": ("agent", market - 5e-4, zeros, zeros),

@@ -43,6 +43,9 @@ reference it is a baseline. A rebalancing is the reference at another speed of r
 JUDGED = ("agent", "ensemble", "strategy")
 """The kinds that are tested."""
 
+CLASSICAL = ("baseline", "strategy")
+"""The kinds whose best are compared with."""
+
 
 class Strategy(NamedTuple):
     """The track records of one strategy over the test days, one row per seed.
@@ -106,7 +109,7 @@ def assess(
     dates: ArrayLike,
     *,
     periods_per_year: float,
-    reference: str = "equal weight",
+    reference: str,
     earlier_trials: int = 0,
     resamples: int = 2000,
     seed: int = 0,
@@ -158,59 +161,30 @@ def assess(
             f"{periods_per_year}."
         )
     free = checked_risk_free(risk_free, periods)
-    # All seeds of all strategies together, so that they share the resampled days.
-    rng = np.random.default_rng(seed)
-    table = np.concatenate([_canonical(track) for track in tracks.values()], axis=1)
-    block = _common_block([_canonical(track)[0].mean(axis=0) for track in tracks.values()])
-    drawn = bootstrap_measures(
-        table[0], table[1], table[2], periods_per_year, block, resamples, rng, free
-    )
-    sampled, end = {}, 0
-    for name, track in tracks.items():
-        seeds = track.shape[1]
-        start, end = end, end + seeds
-        sampled[name] = Sampled(
-            measures(track[0], track[1], track[2], periods_per_year, free),
-            {key: values[:, start:end] for key, values in drawn.items()},
-        )
+    returns = {name: _canonical(track)[0] for name, track in tracks.items()}
+    block = _common_block([each.mean(axis=0) for each in returns.values()])
+    sampled = _sampled(tracks, periods_per_year, free, block, resamples, seed)
 
-    def observed(key: str, name: str) -> float:
+    def mean(key: str, name: str) -> float:
         return mean_over_seeds(sampled[name].observed[key])
 
-    growth, sharpe = partial(observed, "growth"), partial(observed, "sharpe")
-    family = [reference, *(name for name, each in known.items() if each.kind == "rebalancing")]
-    classical = [name for name, each in known.items() if each.kind in ("baseline", "strategy")]
+    growth, sharpe = partial(mean, "growth"), partial(mean, "sharpe")
+    family = (reference, *(name for name, each in known.items() if each.kind == "rebalancing"))
+    classical = tuple(name for name, each in known.items() if each.kind in CLASSICAL)
     rebalanced, best = max(family, key=growth), max(classical, key=growth)
     best_sharpe = max(classical, key=sharpe)
     judged = [name for name, each in known.items() if each.kind in JUDGED]
-    trials = earlier_trials + sum(tracks[name].shape[1] for name in judged)
-    rivals = {"reference": Rival(reference, (reference,))}
-    if len(family) > 1:
-        rivals["rebalanced"] = Rival(rebalanced, tuple(family))
-    if best != reference:
-        one = best == best_sharpe
-        rivals["best"] = Rival(best, tuple(classical), ("growth", "sharpe") if one else ("growth",))
-    if best_sharpe not in (reference, best):
-        rivals["best sharpe"] = Rival(best_sharpe, tuple(classical), ("sharpe",))
-    returns = {name: _canonical(track)[0] for name, track in tracks.items()}
+    trials = earlier_trials + sum(len(returns[name]) for name in judged)
+    ratios = {name: each.observed["sharpe"] for name, each in sampled.items()}
+    tests = sharpe_tests(_less(returns, free), ratios, judged, trials, periods_per_year)
     theirs = returns[rebalanced].mean(axis=0)
-    tests, active_tests = (
-        sharpe_tests(less, ratios, judged, trials, periods_per_year)
-        for less, ratios in (
-            (
-                {name: each - (0.0 if free is None else free) for name, each in returns.items()},
-                {name: each.observed["sharpe"] for name, each in sampled.items()},
-            ),
-            (
-                {name: each - theirs for name, each in returns.items()},
-                {
-                    name: relative(each, theirs, periods_per_year)["information_ratio"]
-                    for name, each in returns.items()
-                },
-            ),
-        )
-    )
+    ratios = {
+        name: relative(each, theirs, periods_per_year)["information_ratio"]
+        for name, each in returns.items()
+    }
+    active_tests = sharpe_tests(_less(returns, theirs), ratios, judged, trials, periods_per_year)
     compared = _relative(known, tracks, reference, periods_per_year, block, resamples, seed)
+    rivals = _rivals(reference, rebalanced, family, best, best_sharpe, classical)
     differences = compare(returns, rivals, judged, periods_per_year, seed, free, earlier_trials)
 
     return Assessment(
@@ -236,7 +210,7 @@ def assess(
         strategies={
             name: StrategyAssessment(
                 kind=known[name].kind,
-                seeds=track.shape[1],
+                seeds=len(returns[name]),
                 measures=sampled[name].measures(unknown=known[name].turnover is None),
                 to_reference=differences["reference"].get(name),
                 to_rebalanced=differences.get("rebalanced", {}).get(name),
@@ -246,9 +220,56 @@ def assess(
                 active_test=None if name == rebalanced else active_tests[name],
                 relative=compared.get(name, {}),
             )
-            for name, track in tracks.items()
+            for name in known
         },
     )
+
+
+def _sampled(
+    tracks: Mapping[str, Floats],
+    periods_per_year: float,
+    free: Floats | None,
+    block: float,
+    resamples: int,
+    seed: int,
+) -> dict[str, Sampled]:
+    """The measures of all seeds of all strategies together, so that they share resampled days."""
+    given = np.concatenate(list(tracks.values()), axis=1)
+    ordered = np.concatenate([_canonical(track) for track in tracks.values()], axis=1)
+    rng = np.random.default_rng(seed)
+    drawn = bootstrap_measures(
+        ordered[0], ordered[1], ordered[2], periods_per_year, block, resamples, rng, free
+    )
+    observed = measures(given[0], given[1], given[2], periods_per_year, free)
+    return Sampled(observed, drawn).split({name: each.shape[1] for name, each in tracks.items()})
+
+
+def _rivals(
+    reference: str,
+    rebalanced: str,
+    family: tuple[str, ...],
+    best: str,
+    best_sharpe: str,
+    classical: tuple[str, ...],
+) -> dict[str, Rival]:
+    """What strategies are compared with, by its role; one that has two roles is there once.
+
+    family: the reference and its rebalancings. classical: what the best are chosen from.
+    """
+    rivals = {"reference": Rival(reference, (reference,))}
+    if len(family) > 1:
+        rivals["rebalanced"] = Rival(rebalanced, family)
+    if best != reference:
+        one = best == best_sharpe
+        rivals["best"] = Rival(best, classical, ("growth", "sharpe") if one else ("growth",))
+    if best_sharpe not in (reference, best):
+        rivals["best sharpe"] = Rival(best_sharpe, classical, ("sharpe",))
+    return rivals
+
+
+def _less(returns: Mapping[str, Floats], other: Floats | None) -> dict[str, Floats]:
+    """Returns less others on the same days, if there are any."""
+    return {name: each if other is None else each - other for name, each in returns.items()}
 
 
 def _relative(
@@ -292,15 +313,10 @@ def _relative(
         resamples,
         seed,
     )
-    result, end = {}, 0
-    for name in names:
-        start, end = end, end + len(tracks[name][0])
-        sampled = Sampled(
-            {key: values[start:end] for key, values in observed.items()},
-            {key: values[:, start:end] for key, values in drawn.items()},
-        )
-        result[name] = {key: sampled.measure(key) for key in RELATIVE}
-    return result
+    parts = Sampled(observed, drawn).split({name: tracks[name].shape[1] for name in names})
+    return {
+        name: {key: sampled.measure(key) for key in RELATIVE} for name, sampled in parts.items()
+    }
 
 
 def _common_block(series: list[Floats]) -> float:

@@ -1,6 +1,7 @@
 """Measures with their intervals, from observed and resampled track records."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,10 +24,24 @@ class Measure:
 
 
 class Sampled(NamedTuple):
-    """The measures of one strategy by seed, observed and resampled."""
+    """The measures of one strategy, or of several, by seed, observed and resampled."""
 
     observed: dict[str, Floats]  # (seeds,)
     drawn: dict[str, Floats]  # (resamples, seeds): the same days for all
+
+    def split(self, seeds: Mapping[str, int]) -> dict[str, "Sampled"]:
+        """The parts of strategies whose seeds are here one after the other.
+
+        seeds: number of seeds of each strategy.
+        """
+        parts, end = {}, 0
+        for name, count in seeds.items():
+            start, end = end, end + count
+            parts[name] = Sampled(
+                {key: values[start:end] for key, values in self.observed.items()},
+                {key: values[:, start:end] for key, values in self.drawn.items()},
+            )
+        return parts
 
     def measures(self, unknown: bool) -> dict[str, Measure]:
         """All in ``MEASURES``; unknown: whether there is neither turnover nor cost."""

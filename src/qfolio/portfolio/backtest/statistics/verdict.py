@@ -1,6 +1,7 @@
 """Verdicts of a backtest in sentences: which references an agent beats, and whether by luck."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,6 +21,10 @@ _MEASURES: dict[Measured, str] = {
 
 _MOVES = {"better": "less", "worse": "more"}
 """Volatility in words, by finding."""
+
+ENDLESS = 1000.0
+"""From this ratio of volatilities on, an interval is shown without an end: its digits, of which
+there may be hundreds, would say nothing."""
 
 
 def verdicts(assessment: Assessment) -> dict[str, list[str]]:
@@ -80,13 +85,18 @@ def at_best_speed(reference: str) -> str:
     return f"the best rebalancing of {reference}"
 
 
-def wiped_out(strategy: StrategyAssessment) -> bool:
-    """Whether a strategy lost everything, with any of its seeds.
+def seeds_lost(drawdowns: Sequence[float]) -> int:
+    """With how many of its seeds a strategy lost everything, by the deepest drawdown of each.
 
-    The drawdown tells; annual growth is also −1, to the last digit, where a short test of intraday
+    Growth does not tell: it is also −1 a year, to the last digit, where a short test of intraday
     rows would lose all but 1e-16 in a year.
     """
-    return 1 in strategy.measures["drawdown"].per_seed
+    return drawdowns.count(1)
+
+
+def wiped_out(strategy: StrategyAssessment) -> bool:
+    """Whether a strategy lost everything, with any of its seeds."""
+    return seeds_lost(strategy.measures["drawdown"].per_seed) > 0
 
 
 def _ruin(name: str, strategy: StrategyAssessment, difference: Difference) -> str:
@@ -94,7 +104,7 @@ def _ruin(name: str, strategy: StrategyAssessment, difference: Difference) -> st
     if not wiped_out(strategy):
         return f"{difference.reference} was wiped out, and {name} was not"
     deepest = strategy.measures["drawdown"].per_seed
-    return lost_everything(name, deepest.count(1), len(deepest))
+    return lost_everything(name, seeds_lost(deepest), len(deepest))
 
 
 def lost_everything(name: str, lost: int, seeds: int) -> str:
@@ -183,7 +193,9 @@ def shown(key: Measured, contrast: Contrast) -> tuple[float, float, float]:
     values = (contrast.value, *contrast.interval)
     if key != "volatility":
         return values
-    value, low, high = (math.expm1(min(value, 700.0)) for value in values)
+    value, low, high = (
+        math.expm1(value) if value < math.log(ENDLESS) else math.inf for value in values
+    )
     return value, low, high
 
 
