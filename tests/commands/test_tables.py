@@ -1,5 +1,7 @@
 """Every command that reads prices reads returns and columns of the market, too."""
 
+import html
+import json
 import os
 import subprocess
 import sys
@@ -16,7 +18,8 @@ from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.prices.table import load
 
-from shell import qfolio
+from shell import TINY_BACKTEST, qfolio
+from tables import write_table
 
 NAMES = ["A", "B", "C"]
 
@@ -73,6 +76,41 @@ def test_a_backtest_says_what_is_implausible_in_its_table(tmp_path, capsys):
     with pytest.raises(QfolioError, match="column 'C': there are no prices at all"):
         Options().load(path)
     assert not capsys.readouterr().out
+
+
+def test_a_backtest_repeats_a_change_of_unit_and_says_which_column_does_nothing(
+    tmp_path, monkeypatch, capsys
+):
+    """A backtest on pence after pounds has absurd returns, and must not look like a sound one."""
+    path = write_table(tmp_path / "prices.csv", names=("A", "B", "C"))
+    frame = pd.read_csv(path, index_col="date")
+    frame.iloc[200:, 1] *= 101.3 * frame.iloc[199, 1] / frame.iloc[200, 1]
+    frame.assign(rate=np.linspace(0.01, 0.03, 260)).to_csv(path)
+    status = qfolio(
+        monkeypatch, "backtest", path, *TINY_BACKTEST, "--columns", "rate",
+        "--out", tmp_path / "run",
+    )  # fmt: skip
+    assert status == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    said = "column 'B': the price is 101.3 times the one before"
+    assert f"Warning: prices.csv, row 202 (2020-07-19), {said}" in printed
+    assert "close to 100: perhaps a split that was not adjusted" in printed
+    assert "No cost reads the column 'rate'; if it is the rate that cash earns, add" in printed
+    page = html.unescape((tmp_path / "run/report.html").read_text(encoding="utf-8"))
+    assert said in page
+
+
+def test_json_has_all_large_moves(tmp_path, monkeypatch, capsys):
+    path = write_table(tmp_path / "prices.csv", names=("A", "B", "C"))
+    frame = pd.read_csv(path, index_col="date")
+    for row in range(20, 220, 20):
+        frame.iloc[row:, row // 20 % 3] *= 0.7
+    frame.to_csv(path)
+    assert qfolio(monkeypatch, "prices", path, "--json") == 0
+    found = json.loads(capsys.readouterr().out)["findings"]
+    (moves,) = [each for each in found if "large moves" in each["message"]]
+    assert (moves["count"], len(moves["cells"])) == (10, 10)
+    assert sorted(cell["row"] for cell in moves["cells"]) == list(range(22, 222, 20))
 
 
 def test_costs_read_a_column_of_the_market(table):

@@ -66,7 +66,7 @@ def backtest(
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
-    from qfolio.portfolio.backtest.notes import mandated, shortened
+    from qfolio.portfolio.backtest.notes import mandated, shortened, unread
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.report.backtest.finish import finish
 
@@ -92,7 +92,8 @@ def backtest(
             "with more rows."
         )
     console.say(describe_backtest(run))
-    for note in (*shortened(run.config.agents, run.replay), *mandated(run.replay)):
+    short = shortened(run.config.agents, run.replay)
+    for note in (*short, *mandated(run.replay), *unread(run.replay)):
         console.tell(note)
     resume = again("qfolio backtest --resume", folder, *run.parts, on=options.on)
     status = "Replaying all strategies, explaining the agents and writing the report"

@@ -240,6 +240,10 @@ HOURS = Prices(np.datetime64("2020-01-01T09:30", "s") + np.arange(ROWS) * np.tim
     [
         (weights([100], A=[1.2]), None, r"long-only, so give weights of at least 0"),
         (weights([100], A=[0.6], cash=[0.6]), None, r"weights of .* sum to 1.2"),
+        (
+            weights([100], A=[60], B=[40]), None,
+            "weights of mine on 2020-04-10 sum to 100 without cash, so they look like percentages",
+        ),
         (weights([100], A=[-0.1], B=[0.5]), None, "weight of -0.1 on 2020-04-10.*long-only"),
         (weights([100, 100], A=[0.1, 0.2]), None, "row 1: 2020-04-10 appears twice"),
         (weights([100], A=[0.1], AB=[0.2]), None, r"no asset 'AB' \(did you mean"),
@@ -250,6 +254,10 @@ HOURS = Prices(np.datetime64("2020-01-01T09:30", "s") + np.arange(ROWS) * np.tim
         (weights([100], asset=["A"], shares=[3]), None, r"is worth 0.00; give the money that it"),
         (weights([99, 100], asset=["cash"] * 2, shares=[3, 3]), None, "paid in after the first"),
         (weights([99, 99], asset=["cash", "A"], shares=[10, 3]), None, "weight of .*long-only"),
+        (
+            weights([99, 99], asset=["cash", "A"], shares=[10, 3]), None,
+            "of cash on 2020-04-09, because its orders cost more than the cash that is there",
+        ),
         (
             weights([100, 100], asset=["cash", "C"], shares=[10, 3]), table(late=120),
             "C has no price yet",

@@ -1,6 +1,7 @@
 """A jump is called a split only where it is one, and a price that goes back is called wrong."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -140,6 +141,63 @@ def test_a_lost_zero():
     assert "goes back in the next row" in tick.message
 
 
+@pytest.mark.parametrize(
+    ("factor", "ratio"),
+    [(1.034 / 4, "1/4"), (0.95 / 3, "1/3"), (1.03 / 2, None), (0.981 / 2, "1/2"), (1.0131e2, "100"),
+     (9.949, "10"), (0.0103, "1/100"), (3.1, "3"), (0.102, "1/10"), (2.04, None), (0.69, None)],
+)  # fmt: skip
+def test_a_split_on_a_day_on_which_the_price_also_moved(factor: float, ratio: str | None):
+    """The further a ratio is from usual moves, the further the price may be from it."""
+    values = market()
+    values[AT:, 1] *= factor
+    (move,) = found(values)
+    assert (move.severity, move.row, move.column) == ("warning" if ratio else "note", AT, "A1")
+    assert not ratio or move.message.endswith(f"close to {ratio}: {SPLIT}")
+    assert ("pence to pounds" in move.advice) == (ratio in ("10", "100", "1/10", "1/100"))
+    assert not ratio or move.advice.endswith("if the price did move like this, leave it.")
+
+
+@pytest.mark.parametrize("factor", [17.0, 35.0, 250.0])
+def test_a_rise_that_nothing_explains(factor: float):
+    values = market()
+    values[AT:, 1] *= factor
+    (move,) = found(values)
+    assert (move.severity, move.row, move.column) == ("warning", AT, "A1")
+    assert "which neither other assets nor a usual split explain: perhaps a wrong" in move.message
+
+
+@pytest.mark.parametrize("factor", [1.97, 0.7, 0.22, 0.55])
+def test_a_large_move_in_the_last_month_is_about_to_be_traded(factor: float):
+    values = market()
+    values[AT:, 1] *= factor
+    (note,) = found(values)
+    assert note.severity == "note"
+    for last in (1, 21, 22):
+        names = list("ABCD")
+        table = pd.DataFrame(values[: AT + last], index=DAYS[: AT + last], columns=names)
+        (move,) = findings(table)
+        assert move.severity == ("note" if last == 22 else "warning")
+        assert (move.row, move.date) == (AT, str(DAYS[AT])[:10])
+
+
+def test_of_other_jumps_five_are_named_and_all_are_in_the_cells():
+    values = market(12)
+    for j in range(7):
+        before, now = values[20 * j + 19 : 20 * j + 21, j]
+        values[20 * (j + 1) :, j] *= (0.72 - 0.005 * j) * before / now
+    (note,) = found(values)
+    assert note.message.startswith("7 large moves")
+    assert "the largest: the price on" in note.message
+    dates = [str(DAYS[20 * (j + 1)])[:10] for j in range(7)]
+    for j in (5, 4, 3, 2):
+        assert f"'A{j}' on {dates[j]} ({0.72 - 0.005 * j:.4g})" in note.message
+    assert note.message.endswith(") and 2 more")
+    assert note.count == 7
+    assert [cell["column"] for cell in note.cells] == [f"A{j}" for j in (6, 5, 4, 3, 2, 1, 0)]
+    assert [cell["date"] for cell in note.cells] == dates[::-1]
+    assert [cell["row"] for cell in note.cells] == [20 * (j + 1) for j in (6, 5, 4, 3, 2, 1, 0)]
+
+
 def test_a_tick_in_a_crash_and_a_split_after_a_tick():
     values = market()
     values[AT] *= 0.8
@@ -171,3 +229,18 @@ def test_of_many_the_latest_are_named_and_the_others_counted(factor: float, rows
     assert [finding.column for finding in named] == [f"A{j}" for j in range(7, 12)]
     assert more.message == f"and 7 more {said}, the latest on this date"
     assert (more.date, more.count) == (str(DAYS[140])[:10], 7)
+    assert [cell["column"] for cell in more.cells] == [f"A{j}" for j in range(7)]
+    assert more.cells[-1]["date"] == more.date
+
+
+def test_a_folder_has_no_rows_of_its_own(tmp_path: Path):
+    values = market(4)
+    for j in range(2):
+        values[50 * (j + 1) :, j] *= 0.7
+    for j in range(4):
+        frame = pd.DataFrame({"close": values[:, j]}, index=DAYS).rename_axis("date")
+        frame.to_csv(tmp_path / f"a{j}.csv")
+    (note,) = findings(tmp_path)
+    assert note.count == 2
+    assert [cell["row"] for cell in note.cells] == [None, None]
+    assert note.row is None

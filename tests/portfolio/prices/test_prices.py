@@ -213,6 +213,7 @@ def test_the_default_table_says_that_it_holds_survivors():
         ({"A2": '"10,5"'}, 2, "A", "the price: '10,5' has a decimal comma, other numbers have p"),
         ({"D5": ""}, 5, "Date", "the date is missing"),
         ({"D5": "soon"}, 5, "Date", "'soon' is not a date that can be read"),
+        ({"D5": "01/07/20"}, 5, "Date", "'01/07/20' may have a year of two digits"),
         ({"D5": "2020-02-30"}, 5, "Date", "'2020-02-30' is not a date of the calendar"),
         ({"D5": "43837"}, 5, "Date", "'43837' is not a date that can be read"),
         ({"D5": "1578355200"}, 5, "Date", "'1578355200' is not a date that can be read"),

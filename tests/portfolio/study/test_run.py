@@ -328,3 +328,13 @@ def test_studies_that_are_refused(tmp_path, options, message):
     with pytest.raises(QfolioError, match=message):
         create(tmp_path / "study", **options)
     assert not (tmp_path / "study").exists()
+
+
+def test_tables_with_the_same_prices_are_named_in_the_result(tmp_path):
+    tables = {"one": TABLES["one"], "cents": price_table(TABLES["one"].values.round(2))}
+    made = create(tmp_path / "study", tables)
+    (said,) = made.config.twins
+    assert said.startswith("one and cents hold nearly the same prices")
+    made.run()
+    assert made.result().twins == [said]
+    assert create(tmp_path / "other").config.twins == []

@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 def describe_study(study: "Study") -> list[str]:
-    """Lines with tables, variants and agents of a study, and why tables are left out."""
+    """Tables, variants and agents of a study, why tables are left out, and which are alike."""
     config = study.config
     variants = amount(len(config.variants), "variant")
     tables = amount(len(config.tables), "table")
     left_out = (f"{name} is left out: {why}" for name, why in config.left_out.items())
     about = f"{tables} · {variants} · {' and '.join(config.agents)} · {config.device}"
-    return [about, *left_out]
+    return [about, *left_out, *config.twins]
 
 
 def print_study(result: "Result") -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from qfolio.core.text import amount
+from qfolio.core.text import amount, plural
 from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.folder import AgentConfig
 from qfolio.portfolio.backtest.folds import Fold, fewest
@@ -49,6 +49,18 @@ def unknown(tasks: Mapping[str, Portfolio], folds: Sequence[Fold]) -> list[str]:
         f"{label} looks back on more rows than {count} of {amount(len(folds), 'fold')} "
         f"{'has' if count == 1 else 'have'} for training; there it is unknown and counts as 0."
         for label, count in found.items()
+    ]
+
+
+def unread(replay: Replay) -> list[str]:
+    """A note on the columns of the market that the costs do not read, so that they do nothing."""
+    names = [name for name in replay.prices.market_names if name not in replay.task.costs.columns]
+    if not names:
+        return []
+    which = "it" if len(names) == 1 else names[0]
+    return [
+        f"No cost reads the {plural('column', len(names))} {listing(names)}; if {which} is the "
+        f'rate that cash earns, add --cost-model "itemized(cash_rate=column:{names[0]})".'
     ]
 
 

@@ -26,6 +26,9 @@ from qfolio.portfolio.task import Portfolio
 Kind = Literal["weights", "returns", "levels"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
+PERCENT = 100.0
+"""What weights sum to if they are percentages."""
+
 OLDEST = np.timedelta64(7, "D")
 """How long a level is carried forward to later rows, which bridges holidays of other exchanges."""
 
@@ -208,9 +211,22 @@ def _require_long_only(name: str, own: Own) -> None:
     least = own.values.min(axis=1)
     if (short := least < -TOLERANCE).any():
         row = int(short.argmax())
+        cash, assets = own.values[row, 0], own.values[row, 1:]
+        if assets.min() >= 0 and abs(assets.sum() - PERCENT) < 1:
+            raise QfolioError(
+                f"The weights of {name} on {day(own.dates[row])} sum to {assets.sum():.4g} without "
+                "cash, so they look like percentages; give fractions that sum to 1 or less (0.6 "
+                "for 60%)."
+            )
+        why = f"a weight of {least[row]:.3g} on {day(own.dates[row])}"
+        if assets.min() >= -TOLERANCE:
+            why = (
+                f"a weight of {cash:.3g} of cash on {day(own.dates[row])}, because its orders cost "
+                "more than the cash that is there, or its weights sum to more than 1"
+            )
         raise QfolioError(
-            f"{name} has a weight of {least[row]:.3g} on {day(own.dates[row])}, counting cash; the "
-            "backtest is long-only, so give weights of at least 0 that sum to 1 or less."
+            f"{name} has {why}; the backtest is long-only, so give weights of at least 0 that sum "
+            "to 1 or less, or orders with enough cash."
         )
 
 

@@ -17,6 +17,7 @@ from qfolio.portfolio.prices.grid import Grid, arrange
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.moves import check_moves
 from qfolio.portfolio.prices.plausibility import FEWEST_ROWS, check_cells, check_size
+from qfolio.portfolio.prices.rates import check_rates
 from qfolio.portfolio.prices.returns import UNITS, cumulate
 from qfolio.portfolio.prices.stale import check_stale
 
@@ -102,7 +103,7 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], Findings]:
     if not len(rest.assets):
         return {}, findings
     check_moves(grid, rest, findings)
-    check_stale(grid, rest, findings)
+    check_stale(grid, rest, findings, check_rates(grid, rest, findings))
     check_duplicates(grid, rest, findings)
     check_size(grid, rest, findings)
     if findings.bad:

@@ -19,6 +19,7 @@ _ZONE = r"(?: ?(Z|UTC|[-+]\d\d:?\d\d))?"
 _YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})(?:[-/.](\d{1,2}))?" + _CLOCK + _ZONE, re.A)
 _DIGITS = re.compile(r"(\d{4})(\d\d)(\d\d)", re.A)
 _YEAR_LAST = re.compile(r"(\d{1,2})[-/.](\d{1,2})[-/.](\d{4})" + _CLOCK + _ZONE, re.A)
+_SHORT_YEAR = re.compile(r"\d{1,2}([-/.])\d{1,2}\1\d{1,2}" + _CLOCK + _ZONE, re.A)
 _TIME = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d)(?:\.\d+)?)?|(\d\d)(\d\d)(\d\d)", re.A)
 _COUNT = re.compile(r"-?\d+(\.\d+)?", re.A)
 
@@ -214,6 +215,8 @@ def _moment(cell: Any, order: str | None) -> datetime | str:
         return f"{quote(cell)} is not a date of the calendar"
     if isinstance(moment, datetime) and moment.year not in YEARS:
         return f"{quote(cell)} lies outside the years {YEARS[0]} to {YEARS[-1]}"
+    if moment is None and isinstance(cell, str) and _SHORT_YEAR.fullmatch(cell.strip()):
+        return f"{quote(cell)} may have a year of two digits, which can be read in several ways"
     return moment or f"{quote(cell)} is not a date that can be read"
 
 

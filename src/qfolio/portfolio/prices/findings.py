@@ -1,7 +1,7 @@
 """Findings: errors, warnings and notes on a price table, with advice."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +20,8 @@ class Finding:
     An error stops the table from being read, a warning reports something implausible, and a note
     says how the table was read. Rows are counted as users see them: in text files from 1, header
     included, as in spreadsheets and editors; in data frames and Parquet files from 0.
+
+    cells: row, column and date of each of them, if a finding stands for several cells.
     """
 
     severity: Severity
@@ -29,6 +31,12 @@ class Finding:
     date: str | None = None
     advice: str = ""
     count: int = 1
+    cells: tuple[dict[str, Any], ...] = ()
+
+    def without_rows(self) -> "Finding":
+        """The same, for a table that was joined, whose rows are not those of any file."""
+        cells = tuple({**cell, "row": None} for cell in self.cells)
+        return replace(self, row=None, cells=cells)
 
     def __str__(self) -> str:
         """Location and message, on one line."""
@@ -62,15 +70,15 @@ class Findings(list[Finding]):
             column = spot(next(iter(said)))["column"]
             self.others("error", len(said), "row", " of this kind", column=column, advice=advice)
 
-    def older(self, moments: Sequence[Any], noun: str, kind: str) -> None:
-        """A warning that counts all but the latest of such moments, which are listed.
+    def older(self, cells: Sequence[dict[str, Any]], noun: str, kind: str) -> None:
+        """A warning that counts all but the latest of such cells, which are listed.
 
         It has the date of the latest one that it counts: whoever looks at later rows than a date
         learns of all findings on them.
         """
-        if (more := len(moments) - LISTED) > 0:
-            date, said = day(moments[more - 1]), f" {kind}, the latest on this date"
-            self.others("warning", len(moments), noun, said, date=date)
+        if (more := len(cells) - LISTED) > 0:
+            date, said = cells[more - 1]["date"], f" {kind}, the latest on this date"
+            self.others("warning", len(cells), noun, said, date=date, cells=tuple(cells[:more]))
 
     def others(self, severity: Severity, total: int, noun: str, said: str, **rest: Any) -> None:
         """Counts the findings of a kind that are not listed; total: of all of its findings."""
@@ -90,11 +98,11 @@ def day(moment: Any) -> str:
     return text.removesuffix("T00:00:00").replace("T", " ")
 
 
-def first_of(texts: Iterable[str]) -> str:
+def first_of(texts: Iterable[str], few: int = LISTED) -> str:
     """The first few, and how many more there are."""
     every = list(texts)
-    rest = len(every) - LISTED
-    return ", ".join(every[:LISTED]) + (f" and {rest:,} more" if rest > 0 else "")
+    rest = len(every) - few
+    return ", ".join(every[:few]) + (f" and {rest:,} more" if rest > 0 else "")
 
 
 def listing(names: Iterable[str]) -> str:

@@ -15,7 +15,7 @@ from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.vocabulary import plain
 
 MOST_CELLS, SPARSEST = 100_000_000, 0.05  # a long table that would be this large and this empty
-WRITE_DATES = "Write dates as 2020-01-31."
+WRITE_DATES = "Write dates as 2020-01-31, with a year of four digits."
 ONE_CURRENCY = "Convert all prices to one currency."
 
 

@@ -2,7 +2,8 @@
 
 A jump is a large move for its asset that the other assets do not share. One that reverts within a
 few rows is a bad tick. One that persists, at a ratio at which companies split their shares, looks
-like a split; any other is left for the reader to judge.
+like a split, or like another unit. Any other is left for the reader to judge, unless hardly any
+price moves by as much, or it is about to be traded.
 """
 
 from collections.abc import Iterable
@@ -10,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from qfolio.core.text import amount
-from qfolio.portfolio.prices.findings import LISTED, Findings, day
+from qfolio.core.text import amount, quote
+from qfolio.portfolio.prices.findings import LISTED, Findings, day, first_of
+from qfolio.portfolio.prices.frequency import periods_per_year
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Grid
 
@@ -23,13 +25,19 @@ TICKS = 10  # a jump of fewer price ticks says nothing: the next price above 0.0
 BRIEF = 3  # rows that a bad tick lasts at most
 SPLITS = (1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 100, 1000)
 EXACT = 0.005  # how far a jump's ratio may be from one of these
-LOOSE = 0.03  # the same, at most, for a fall to one half or less: the price also moves that day
+
+# The price also moves on the day of a split. A ratio of whole numbers may therefore be further off:
+# by so many times the asset's usual move, and by so much in log at most. Prices do fall by about
+# one half at times; hardly ever do they fall to a third, or rise to its inverse.
+HALF = (2.0, 0.035)
+RARE = (6.0, 0.1)
+ABSURD = 5.0  # a rise to so many times the price before is doubtful at any ratio; firms do fail
 
 Jump = tuple[int, int]  # the row before the jump, and the asset
 
 
 def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
-    """Report impossible moves, bad ticks, likely splits, and how many other jumps there are."""
+    """Report impossible moves, bad ticks, likely splits and other jumps."""
     values = np.where(np.isfinite(rest.values) & (rest.values > 0), rest.values, np.nan)
     with np.errstate(over="ignore", divide="ignore", under="ignore"):
         relatives = values[1:] / values[:-1]
@@ -62,22 +70,47 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
             "(--missing).",
             **spot(i + 1, j),
         )
-    findings.older([dates[i + 1] for i, _ in ticks], "price", "that may be wrong")
+    findings.older([spot(i + 1, j) for i, j in ticks], "price", "that may be wrong")
     for (i, j), ratio in list(splits.items())[-LISTED:]:
+        unit = ratio.strip("0") in ("1", "1/1")  # a power of ten
         findings.warn(
             f"{subject(j)} is {relatives[i, j]:.4g} times the one before, close to {ratio}: "
             "perhaps a split that was not adjusted",
-            advice="If so, use adjusted prices.", **spot(i + 1, j),
-        )  # fmt: skip
-    findings.older([dates[i + 1] for i, _ in splits], "move", "that may be splits")
+            advice="If so, use adjusted prices; "
+            + "if the unit changed, as from pence to pounds, convert it; " * unit
+            + "if the price did move like this, leave it.",
+            **spot(i + 1, j),
+        )
+    findings.older([spot(i + 1, j) for i, j in splits], "move", "that may be splits")
+    newest = len(moves) - max(1, round(periods_per_year(dates) / 12))  # the last month begins
+    doubtful = [jump for jump in others if jump[0] >= newest or moves[jump] > np.log(ABSURD)]
+    for i, j in doubtful[-LISTED:]:
+        findings.warn(
+            f"{subject(j)} is {relatives[i, j]:.4g} times the one before, which neither other "
+            "assets nor a usual split explain: perhaps a wrong price",
+            advice="If so, correct it; if the price did move like this, leave it.",
+            **spot(i + 1, j),
+        )
+    findings.older([spot(i + 1, j) for i, j in doubtful], "move", "that nothing explains")
+    others = sorted(set(others) - set(doubtful), key=lambda jump: -sizes[jump])
     if others:
-        i, j = max(others, key=lambda jump: sizes[jump])
-        when = day(dates[i + 1])
+        (i, j), *further = others
+        more = first_of(
+            (
+                f"{quote(grid.assets[rest.assets[b]])} on {day(dates[a + 1])} "
+                f"({relatives[a, b]:.4g})"
+                for a, b in further
+            ),
+            LISTED - 1,
+        )
         findings.note(
             f"{amount(len(others), 'large move')} that neither other assets nor a split explain; "
-            f"the largest: {subject(j)} on {when} is {relatives[i, j]:.4g} times the one before",
+            f"the largest: {subject(j)} on {day(dates[i + 1])} is {relatives[i, j]:.4g} times the "
+            "one before" + f", then {more}" * bool(more),
             advice="Check them: a split on a day on which the price also moved looks like this.",
             **spot(i + 1, j),
+            count=len(others),
+            cells=tuple(spot(a + 1, b) for a, b in others),
         )
 
 
@@ -126,15 +159,26 @@ def _sort_out(
             sound[j] = i + 1 + rows
             continue
         distances = np.abs(ratios - abs(jump))
-        split = SPLITS[distances.argmin()]
-        # Prices rise by about such a ratio in takeovers, and fall by about a third on bad news.
-        divided = jump < 0 and split % 1 == 0
-        loose = min(1.5 * _usual(np.abs(moves[:, j])), LOOSE) if divided else 0.0
-        if distances.min() <= max(np.log1p(EXACT), loose):
-            splits[i, j] = _ratio(split, jump > 0)
+        fits = distances <= _tolerances(_usual(np.abs(moves[:, j])), jump > 0)
+        if fits.any():
+            closest = int(np.where(fits, distances, np.inf).argmin())
+            splits[i, j] = _ratio(SPLITS[closest], jump > 0)
         else:
             others.append((i, j))
     return ticks, splits, others
+
+
+def _tolerances(usual: float, up: bool) -> np.ndarray:
+    """How far a jump of an asset with this usual move may be from each of the ratios, in log."""
+
+    def loose(split: float) -> float:
+        # Prices rise to about the double in takeovers, and fall by about a third on bad news.
+        if split % 1 or (up and split < 3):
+            return 0.0
+        times, most = RARE if split >= 3 else HALF
+        return min(times * usual, most)
+
+    return np.array([max(np.log1p(EXACT), loose(split)) for split in SPLITS])
 
 
 def _usual(sizes: np.ndarray) -> float:

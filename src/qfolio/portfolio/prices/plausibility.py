@@ -86,13 +86,15 @@ def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:
     steps, usual = spacing(dates)
     closed = 0.0 if every_day(dates) else 7.0  # markets with weekends have holidays, too
     long = np.flatnonzero(steps > 3 * usual + closed)
-    for k in long[-LISTED:].tolist():
+    several = grid.long or grid.table.turned  # cells of a date are in several rows, or in a column
+    spots = []
+    for k in long.tolist():
+        row = None if several else grid.spot(grid.prices, rest.head + k + 1, 0)["row"]
+        spots.append({"row": row, "date": day(dates[k + 1])})
+    for k, spot in list(zip(long.tolist(), spots, strict=True))[-LISTED:]:
         findings.warn(
             f"the previous row is {day(dates[k])}, {steps[k]:.4g} days earlier "
             f"(usual: {usual:.4g})",
-            row=None
-            if grid.long or grid.table.turned
-            else grid.spot(grid.prices, rest.head + int(k) + 1, 0)["row"],
-            date=day(dates[k + 1]),
+            **spot,
         )
-    findings.older([dates[k + 1] for k in long], "gap", "between dates")
+    findings.older(spots, "gap", "between dates")

@@ -5,7 +5,7 @@ spell of equal prices is therefore long only by the measure of its own asset, an
 nothing moves, such as holidays, do not lengthen it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +31,13 @@ class _Spell(NamedTuple):
     whole: bool  # whether the asset never had another price
 
 
-def check_stale(grid: Grid, rest: Rest, findings: Findings) -> None:
-    """Report prices that no longer change, never did, or long did not, and rows without moves."""
+def check_stale(
+    grid: Grid, rest: Rest, findings: Findings, rates: Collection[int] = frozenset()
+) -> None:
+    """Report prices that no longer change, never did, or long did not, and rows without moves.
+
+    rates: assets of the rest whose numbers may change rarely, because they seem to be no prices.
+    """
     values, dates = rest.values, grid.dates[rest.head :]
     if len(values) <= FEWEST:
         return
@@ -41,7 +46,8 @@ def check_stale(grid: Grid, rest: Rest, findings: Findings) -> None:
     moves = both & (values[1:] != values[:-1])
     idle = ~moves.any(axis=1) & (both.sum(axis=1) > 1)  # an asset alone may stand still
     _report_idle(dates, idle, moves, both, findings)
-    spells = list(_spells(known, _changes(values), np.concatenate([[0], np.cumsum(~idle)])))
+    clock = np.concatenate([[0], np.cumsum(~idle)])
+    spells = [each for each in _spells(known, changes(values), clock) if each.asset not in rates]
     last = len(values) - 1
     constant = [spell for spell in spells if spell.whole]
     _report_constant(grid, rest, constant, findings)
@@ -58,7 +64,7 @@ def check_stale(grid: Grid, rest: Rest, findings: Findings) -> None:
         )
 
 
-def _changes(values: np.ndarray) -> np.ndarray:
+def changes(values: np.ndarray) -> np.ndarray:
     """Whether a price differs from the last one before it, of shape (rows − 1, assets)."""
     filled = fill_forward(values)
     return (filled[1:] != filled[:-1]) & ~np.isnan(filled[:-1])

@@ -362,7 +362,7 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
     table = reading.read(source, lambda names: text_columns(names, chosen.date))
     content, findings = examine(table, chosen)
     if joined:  # its rows are not those of any file
-        findings = Findings([*(replace(finding, row=None) for finding in findings), *others])
+        findings = Findings([*(finding.without_rows() for finding in findings), *others])
     if findings.bad or not content:
         return None, findings
     for name, file in chosen.series.items():

@@ -9,6 +9,16 @@ CASH = "cash"
 ADJUSTED_NAMES = ("adjusted close", "adj close", "adjclose", "adjusted price", "adj price")
 PRICE_NAMES = ("close", "price", "value")
 RETURN_NAMES = ("return", "returns", "ret", "net return", "net returns", "daily return")
+RATE_NAMES = (
+    "rate", "rates", "yield", "yields", "riskfree", "risk free", "tbill", "t bill", "irx", "fvx",
+    "tnx", "tyx", "vix", "euribor", "libor",
+)  # fmt: skip
+"""Words in the names of rates, yields and volatility indices, which are no prices."""
+PRICED_NAMES = (
+    "high yield", "floating rate", "fixed rate", "bond", "bonds", "etf", "fund", "futures", "note",
+    "notes", "reit", "short", "trust",
+)  # fmt: skip
+"""Words in the names of assets that are named after such a rate."""
 SETTINGS = (
     "security", "securities", "start date", "end date", "period", "periodicity", "currency",
 )  # fmt: skip
@@ -42,6 +52,15 @@ def plain(name: str) -> str:
 def is_cash(name: str) -> bool:
     """Whether this is the name of the money that is not invested."""
     return plain(name) == CASH
+
+
+def is_rate(name: str) -> bool:
+    """Whether the name says that a column holds a rate, a yield or a volatility index."""
+    words = f" {' '.join(re.findall(r'[a-z0-9]+', name.lower()))} "
+    rate, priced = (
+        any(f" {each} " in words for each in names) for names in (RATE_NAMES, PRICED_NAMES)
+    )
+    return rate and not priced
 
 
 def kind(name: str) -> str | None:

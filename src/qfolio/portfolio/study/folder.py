@@ -90,7 +90,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     variants: the main one first. looks: number taken by this study. earlier: number of earlier
     looks at its tables. trials: the largest number of looks at any one table, earlier ones
     included. threshold: z that the best of so many trials is expected to reach without skill.
-    verdicts: sentences by agent.
+    verdicts: sentences by agent. twins: sentences on tables that hold nearly the same prices.
     """
 
     variants: list[VariantResult]
@@ -99,6 +99,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     trials: int
     threshold: float
     verdicts: dict[str, list[str]]
+    twins: list[str] = msgspec.field(default_factory=list)
 
 
 class StudyConfig(Config, frozen=True):
@@ -116,6 +117,7 @@ class StudyConfig(Config, frozen=True):
     command: str
     device: str
     started: str
+    twins: list[str] = msgspec.field(default_factory=list)
     earlier: list[Look] = msgspec.field(default_factory=list)
     looks: list[Look] = msgspec.field(default_factory=list)
     result: Result | None = None

@@ -38,11 +38,10 @@ from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.folder import MOST_TRIALS
-from qfolio.portfolio.backtest.folds import parse_length, require_fold, require_tested
+from qfolio.portfolio.backtest.folds import parse_length, require_fold
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
-from qfolio.portfolio.backtest.statistics.estimates import SHORTEST
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
 from qfolio.portfolio.backtest.writing import write_tables
 from qfolio.portfolio.prices.table import Prices, describe, load
@@ -57,6 +56,7 @@ from qfolio.portfolio.study.folder import (
 )
 from qfolio.portfolio.study.summary import summarize
 from qfolio.portfolio.study.training import Listen, Trainings, of_table
+from qfolio.portfolio.study.twins import twins
 from qfolio.portfolio.study.verdict import decimal, growth_text
 
 Report = Callable[[Backtest, dict[str, Entry], Assessment, list[str], Why | None], None]
@@ -95,7 +95,7 @@ class Study:
     ) -> "Study":
         """A study before its first backtest.
 
-        Tables that are too short for one whole fold, a test of ``SHORTEST`` rows, or an agent's
+        Tables that are too short for one whole fold, a test of five rows, or an agent's
         window and episodes are left out (``config.left_out`` says why).
 
         Args:
@@ -145,7 +145,6 @@ class Study:
                 with of_table(name):
                     try:
                         require_fold(table.dates, train, test, max(lags, default=1))
-                        require_tested(table.dates, train, SHORTEST)
                         for variant in variants:
                             Backtest.create(
                                 table,
@@ -172,6 +171,7 @@ class Study:
                     if name not in left_out
                 },
                 left_out=left_out,
+                twins=twins({n: table for n, table in tables.items() if n not in left_out}),
                 variants=variants,
                 agents=list(agents),
                 train=train,

@@ -38,6 +38,7 @@ def summarize(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]])
         trials=trials,
         threshold=threshold,
         verdicts=verdicts(pooled[0], threshold),
+        twins=config.twins,
     )
 
 

@@ -94,7 +94,7 @@ def _sharpe(pools: Pools) -> str:
 
 
 def looks_sentence(result: Result) -> str:
-    """How many looks were taken, and which z luck alone is expected to reach."""
+    """How many looks were taken, which z luck alone is expected to reach, and what counts twice."""
     tables = len(next(iter(result.variants[0].agents.values())).evidence)
     earlier, z = "", "z" if tables == 1 else "pooled z"
     if result.earlier:
@@ -106,7 +106,7 @@ def looks_sentence(result: Result) -> str:
             f" The best of {result.trials:,} configurations without skill is expected to reach a "
             f"{z} of {decimal(result.threshold)}; a lower z is no evidence."
         )
-    return sentence
+    return " ".join([sentence, *result.twins])
 
 
 def growth_text(value: float | None) -> str:
