@@ -8,10 +8,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
-from qfolio.core.errors import QfolioError, require_list
+from qfolio.core.errors import QfolioError, require_list, require_methods
 from qfolio.core.population import Population
 from qfolio.core.training import Episodes
 from qfolio.experiments.budget import Budget
@@ -135,10 +136,12 @@ class Listener:
         """After the last chunk, also if Ctrl-C stopped the training; not after an error."""
 
 
-def require_listeners(listeners: object) -> None:
-    """Raises QfolioError unless the argument is a list of listeners."""
+def require_listeners(listeners: Any) -> None:
+    """Raises QfolioError unless the argument is a list of listeners that can be called."""
     wanted = "a list of objects whose classes derive from qfolio.Listener"
     require_list("listeners", listeners, Listener, wanted)
+    for listener in listeners:
+        require_methods(type(listener), Listener)
 
 
 def fit(
