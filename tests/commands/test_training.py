@@ -136,7 +136,7 @@ def test_live_shows_no_other_task_that_is_resumed(monkeypatch, capsys, tmp_path)
     assert "there is nothing to see of finite/cliff" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["train", "tune"])
+@pytest.mark.parametrize("command", ["train", "tune", "compare", "backtest", "study"])
 def test_no_cluster_is_asked_for_workers_if_the_results_have_no_place(
     command, monkeypatch, capsys, tmp_path
 ):

@@ -16,6 +16,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.experiments.budget import Budget
 
 if TYPE_CHECKING:
+    from qfolio.experiments.executor import Executor
     from qfolio.experiments.run_folder import RunConfig
     from qfolio.experiments.tuning.run import SearchConfig
 
@@ -67,6 +68,21 @@ def new_folder(*words: str) -> Path:
     name = "-".join([re.sub("[/:]", "-", word) for word in words])
     now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
     return Path("runs") / f"{name}-{now}-{secrets.token_hex(2)}"
+
+
+def executor_of(
+    on: str, out: Path | None, resumed: Path | None, option: str = "--resume"
+) -> "Executor":
+    """What ``--on`` names; a folder that cannot be made is refused before a cluster is asked.
+
+    option: gives ``resumed``, the folder of earlier work.
+    """
+    from qfolio.core.files import require_new
+    from qfolio.experiments.machines.choice import on as chosen
+
+    if resumed is None:
+        require_new(out or new_folder("run"), option)
+    return chosen(on)
 
 
 def prepare(trust: Sequence[str]) -> None:

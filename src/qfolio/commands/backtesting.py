@@ -19,6 +19,7 @@ from qfolio.commands.arguments import (
     Sources,
     Trackers,
     continues,
+    executor_of,
     new_folder,
     sources,
     typed,
@@ -29,6 +30,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import hint, near
 
 if TYPE_CHECKING:
+    from qfolio.experiments.executor import Executor
     from qfolio.experiments.presets import Preset
     from qfolio.portfolio.mandate.mandate import Mandate
 
@@ -118,6 +120,10 @@ class Options(Reading):
         table: Whether those for reading a table may be typed, too.
         """
         return continues(*(READING.reading if table else ()))
+
+    @property
+    def executor(self) -> "Executor":
+        return executor_of(self.on, self.out, self.resume)
 
     def folder(self, kind: str) -> Path:
         """The path of the new folder: ``out``, or runs/KIND-TIME."""

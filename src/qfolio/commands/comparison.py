@@ -13,6 +13,7 @@ from qfolio.commands.arguments import (
     Trackers,
     budget_of,
     continues,
+    executor_of,
     new_folder,
     prepare,
     typed,
@@ -79,9 +80,8 @@ def compare(
     from qfolio.experiments.comparison.run import Comparison
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
-    from qfolio.experiments.machines.choice import on as executor_of
 
-    executor, following = executor_of(on), trackers(track)
+    executor, following = executor_of(on, out, resume), trackers(track)
     if resume is None:
         task = task or "pendulum"
         run = Comparison.create(

@@ -65,12 +65,11 @@ def backtest(
     from qfolio.core.files import read_json
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
-    from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.backtest.notes import mandated, shortened, unread
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.report.backtest.finish import finish
 
-    executor, following = on(options.on), trackers(options.track)
+    executor, following = options.executor, trackers(options.track)
     if options.resume is None:
         folder = options.folder("backtest")
         run = Backtest.create(

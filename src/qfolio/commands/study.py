@@ -55,13 +55,12 @@ def study(
     from qfolio.commands.progress import JobsProgress, stop
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
-    from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.backtest.notes import shortened
     from qfolio.portfolio.study.run import Study
     from qfolio.report.backtest.finish import write_page
     from qfolio.report.study import write_study_report
 
-    executor, following = on(options.on), trackers(options.track)
+    executor, following = options.executor, trackers(options.track)
     if options.resume is None:
         basis_points("--cost-bps", options.cost_bps)  # refuses a wrong one by its own name
         costs = _numbers("--costs-bps", costs_bps, options.cost_bps)

@@ -16,6 +16,7 @@ from qfolio.commands.arguments import (
     Trackers,
     budget_of,
     continues,
+    executor_of,
     new_folder,
     prepare,
     training_command,
@@ -93,12 +94,10 @@ def train(
     from qfolio.commands import console
     from qfolio.commands.console.training import describe_run
     from qfolio.commands.progress import stop
-    from qfolio.core.files import require_new
     from qfolio.experiments import presets
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.lasting import lasting
     from qfolio.experiments.log import tracked
-    from qfolio.experiments.machines.choice import on as executor_of
     from qfolio.experiments.run import Run
     from qfolio.report.contrast import contrast_of
 
@@ -106,9 +105,7 @@ def train(
     budget = budget_of(episodes, steps)
     if live and on != "here":
         raise QfolioError("--live shows a training in this process; leave out --on, or --live.")
-    if resume is None and out is not None:
-        require_new(out)  # before a cluster is asked for workers
-    executor = executor_of(on)
+    executor = executor_of(on, out, resume)
     if live and task is not None:
         _require_seen(task)
     with _window(live) as show:

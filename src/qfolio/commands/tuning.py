@@ -14,6 +14,7 @@ from qfolio.commands.arguments import (
     Trackers,
     budget_of,
     continues,
+    executor_of,
     new_folder,
     prepare,
     training_command,
@@ -88,15 +89,11 @@ def tune(
     from qfolio.commands import console
     from qfolio.commands.console.tuning import describe_search
     from qfolio.commands.progress import print_batch, stop
-    from qfolio.core.files import require_new
     from qfolio.experiments import presets
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
-    from qfolio.experiments.machines.choice import on as executor_of
 
-    if join is None and out is not None:
-        require_new(out, "--join")  # before a cluster is asked for workers
-    executor, following = executor_of(on), trackers(track)
+    executor, following = executor_of(on, out, join, "--join"), trackers(track)
     budget = budget_of(episodes, steps)
     if join is None:
         task, preset = task or "pendulum", "fast" if preset is None else preset
