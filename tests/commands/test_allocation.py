@@ -156,6 +156,47 @@ def test_after_its_trades_an_allocation_is_not_made_again(copy, monkeypatch, cap
     assert "It supersedes record 1 of the same date" in capsys.readouterr().out
 
 
+def test_after_its_trades_neither_rounding_nor_adjusted_prices_let_it_be_made_again(
+    copy, monkeypatch, capsys, tmp_path
+):
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    holdings, adjusted = tmp_path / "holdings.csv", tmp_path / "adjusted.csv"
+    of = ["--agent", "equal-weight"]
+    plan = allocation(copy, monkeypatch, capsys, *of, "--capital", 3000, "--whole-shares")
+    lines = [f"{row['asset']},{row['trade_shares']}" for row in plan["assets"]]
+    holdings.write_text("\n".join(["asset,shares", *lines, f"cash,{plan['cash_after']}", ""]))
+    head, *rows = write_table(tmp_path / "prices.csv").read_text().split()
+    cells = [row.split(",") for row in rows]
+    lines = [
+        f"{day},{float(a) * (0.99 if day < '2020-09' else 1)},{b},{c}" for day, a, b, c in cells
+    ]
+    adjusted.write_text("\n".join([head, *lines]))
+    held = ["allocate", copy, *AS_OF, "--holdings", holdings, *of]
+    for options in ([], ["--prices", adjusted], ["--whole-shares", "--prices", adjusted]):
+        assert qfolio(monkeypatch, *held, *options) == 2
+        assert "of record 1 of 2020-09-16 after its trades, so that" in capsys.readouterr().err
+    assert len(records(copy)) == 1
+
+
+def test_a_history_that_is_not_the_backtests_is_refused_or_named(
+    folder, monkeypatch, capsys, tmp_path
+):
+    newer = write_table(tmp_path / "newer.csv", rows=270, names=("A", "B", "C"))
+    of = ["--prices", newer, "--as-of", "2020-09-26", "--capital", 100, "--dry-run"]
+    head, *rows = newer.read_text().split()
+    newer.write_text("\n".join(["date,C,B,A", *rows]))
+    assert qfolio(monkeypatch, "allocate", folder, *of) == 2
+    said = "qfolio: The price table has other returns than the backtest's for A, C, on most of the"
+    assert said in capsys.readouterr().err
+    cells = [row.split(",") for row in rows]
+    cells[99][1] = str(1.3 * float(cells[99][1]))
+    newer.write_text("\n".join([head, *map(",".join, cells)]))
+    assert qfolio(monkeypatch, "allocate", folder, *of) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Warning: newer.csv, 2020-04-09, column 'A': the return is +" in said
+    assert "in the backtest's table (the first of 2 that differ). Correct the table" in said
+
+
 def test_a_deposit_after_the_trades_is_invested(copy, monkeypatch, capsys, tmp_path):
     shutil.rmtree(copy / "ledger", ignore_errors=True)
     holdings = tmp_path / "holdings.csv"
@@ -589,7 +630,7 @@ def test_a_budget_of_the_year_is_that_of_the_ledger(tmp_path, monkeypatch, capsy
     first = json.loads(printed.out)
     assert "fills orders over 3 rows" in printed.err
     assert "orders have used 0.0% this year, and this one uses 90.0%" in printed.err
-    assert "The expected cost assumes a single trade" in printed.err
+    assert "The expected cost is that of all parts" in printed.err
     assert first["spent"] == 0
     assert sum(row["weight"] for row in first["assets"]) == pytest.approx(0.9)  # the whole order
     # A row later one of three parts is filled, and then another one.

@@ -187,6 +187,19 @@ def test_a_gain_at_every_row_is_above_the_band(folder, monkeypatch, capsys, tmp_
     assert qfolio(monkeypatch, "follow", folder, "--prices", prices) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "Live is above the band." in printed
+    assert "consistent" not in printed + (folder / "follow.html").read_text()
+
+
+def test_two_rows_have_no_annual_figures(folder, monkeypatch, capsys, tmp_path):
+    prices = table(tmp_path / "later.csv", 323)
+    out = tmp_path / "few.csv"
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    for number in (1, 2):
+        (copy / "ledger" / f"{number:04d}.json").unlink()
+    assert qfolio(monkeypatch, "follow", copy, "--prices", prices, "--out", out) == 0
+    (live,) = (line for line in capsys.readouterr().out.split("\n") if line.startswith("live"))
+    assert live.split()[2:5] == ["–", "–", "–"]
+    assert "<td>–</td><td>–</td><td>–</td>" in (tmp_path / "few.html").read_text()
 
 
 def test_rows_that_a_backtest_was_given_later_are_live(folder, tmp_path, monkeypatch):

@@ -48,15 +48,11 @@ def render_following(
         title: Its heading.
         sentences: The findings; the first ones appear at the top.
         rows: The data to draw; at least one row.
-        measures: Growth, growth per year, volatility, Sharpe ratio and drawdown, by name; may be
-            empty for a name with too few rows.
+        measures: Growth, growth per year, volatility, Sharpe ratio and drawdown, by name; NaN
+            where there are too few rows.
     """
     table = [
-        (
-            name,
-            [number(x, 2) if key == "sharpe" else percent(x) for key, x in found.items()]
-            or ["–"] * 5,
-        )
+        (name, [number(x, 2) if key == "sharpe" else percent(x) for key, x in found.items()])
         for name, found in measures.items()
     ]
     chart = svgs(draw_following, rows, WIDTH)

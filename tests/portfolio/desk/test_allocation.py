@@ -210,6 +210,23 @@ def test_costs_by_kind():
     np.testing.assert_allclose(allocation.reached, [0.2, 0.4, 0.4], atol=40 / 10_000)
 
 
+@pytest.mark.parametrize(("fill", "fees"), [(1, 1), (3, 3)])
+def test_each_order_has_its_own_cost(fill, fees):
+    """A tenth of 10,000 is bought of A and half of B; both pay a fee, and B half of a 2% spread."""
+    mandate = mandate_text({"trading": {"fill": fill}}, ("A", "B"))
+    model = Itemized(0.0, fixed=4.0, spread="0.02", capital=10_000.0)
+    policy = Fixed([0.4, 0.1, 0.5], model, mandate)
+    allocation = Allocation.of(policy, PRICES, np.zeros(2), 10_000.0)
+    spreads = allocation.trades * allocation.prices / 0.99 * 0.01
+    assert allocation.costs["fixed"] == pytest.approx(8 * fees)
+    assert allocation.cost == pytest.approx(8 * fees + spreads.sum())
+    assert allocation.cash_after == pytest.approx(0.4 * (10_000 - allocation.cost))
+    header, rows = order_rows(allocation, "generic", "USD")
+    found = {row[1]: row[header.index("expected_cost")] for row in rows}
+    wanted = dict(zip("AB", (4 * fees + spreads).tolist(), strict=True))
+    assert found == pytest.approx(wanted, abs=0.01)
+
+
 def test_monthly_prices_are_fresh_until_the_next_are_due():
     months = np.array(["2024-09-30", "2024-10-31", "2024-11-30"], "datetime64[s]")
     monthly = Prices(months, ("A", "B"), np.ones((3, 2)))

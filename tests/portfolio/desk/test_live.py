@@ -13,6 +13,7 @@ from qfolio.portfolio.desk.follow import Following
 from qfolio.portfolio.desk.ledger import Record, _of
 from qfolio.portfolio.desk.live import mark
 from qfolio.portfolio.itemized import Itemized
+from qfolio.portfolio.mandate.limits import mandate_text
 
 from fixed import Fixed
 from tables import days, price_table, random_walk
@@ -117,8 +118,39 @@ def by_hand(values, shares, cash, trades):
     plan = Allocation(
         "2024-01-01", ("A",), prices.values[0], np.array([shares]), cash,
         np.array([0.5, 0.5]), np.array([trades]), {}, 0.0,
+        np.zeros(1),
     )  # fmt: skip
     return prices, record(plan, 1)
+
+
+@pytest.mark.parametrize("parts", [1, 3, 7])
+@pytest.mark.parametrize(
+    "model",
+    [
+        Proportional(0.002), Itemized(0.001, fixed=2.0, minimum=5.0, capital=1e4),
+        Itemized(0.001, fixed=2.0, impact=1.0, volume="1000", capital=1e4),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("whole", [False, True])
+def test_what_a_filled_order_costs_is_what_was_expected(parts, model, whole):
+    """While prices stay, all parts together, and they leave the cash that was expected."""
+    values = np.concatenate([table(40).values, np.repeat(table(40).values[-1:], 10, axis=0)])
+    prices = price_table(values, dates=days(50, "2024-01-01"))
+    mandate = mandate_text({"trading": {"fill": parts}}, NAMES)
+    before = prices.between(None, 40)
+    held = np.array([20.0, 0.0, 60.0])
+    for target in ([0.0, 0.5, 0.2, 0.3], [0.4, 0.2, 0.2, 0.2]):
+        policy = Fixed(target, model, mandate)
+        plan = Allocation.of(policy, before, held, 5000.0, whole_shares=whole)
+        found = mark([record(plan, 1)], prices, model, lag=0, fills=[parts])
+        # Impact depends on the volatility of the last rows, which falls while prices stay.
+        rel = 0.1 if "impact" in plan.costs else 1e-9
+        assert plan.cost == pytest.approx(found.costs.sum(), rel=rel)
+        assert plan.cash_after == pytest.approx(found.cash[-1], abs=plan.cost * rel + 1e-2)
+        assert plan.cash_after >= 0
+        assert plan.order_costs.sum() == pytest.approx(plan.cost)
+        if not whole:
+            np.testing.assert_allclose(plan.reached, target, atol=1e-5)
 
 
 def test_a_trade_that_waits_a_row_by_hand():
@@ -176,12 +208,50 @@ def test_sharpe_ratios_are_of_returns_over_cash():
     found, cash = mark([one], prices, Proportional(0.0), lag=0), np.array([0.01, 0, 0.02, 0.01])
     none = np.zeros(4)
     followed = Following(
-        "x", [one], found, none, cash, none, "y", none, "", np.ones((3, 4)), none + 1, 252, None,
+        "x", [one], found, none, cash, none, "y", none, "", np.ones((3, 4)), none + 1, 12, None,
         False, "1y",
     )  # fmt: skip
     excess = found.returns - cash
-    sharpe = excess.mean() / excess.std(ddof=1) * 252**0.5
+    sharpe = excess.mean() / excess.std(ddof=1) * 12**0.5
     assert followed.rows()["live"]["sharpe"] == pytest.approx(sharpe)
+
+
+def following(values, band, year=252.0, evidence=1.0):
+    """A holding of 10 shares, whose backtest leads one to expect this band at every row."""
+    prices, one = by_hand([[value] for value in values], 10.0, 0.0, 0.0)
+    found = mark([one], prices, Proportional(0.0), lag=0)
+    none = np.zeros(len(found.returns))
+    return Following(
+        "x", [one], found, none, none, none, "y", none, "", np.outer(band, none + 1),
+        none + evidence, year, None, False, "1y",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("band", "place"),
+    [((1.1, 1.2, 1.3), "Live is below the band."), ((0.7, 0.8, 0.9), "Live is above the band.")],
+)
+def test_outside_the_band_live_is_not_called_consistent(band, place):
+    said = " ".join(following([10.0, 10, 10], band, evidence=1.2).sentences())
+    assert place in said
+    assert "consistent" not in said
+    assert (
+        "There is no alarm yet: the backtest is not refuted (evidence against it 1.2, alarm at 40)."
+    ) in said
+    said = " ".join(following([10.0, 10, 10], (0.9, 1.0, 1.1)).sentences())
+    assert "Live returns are consistent with the backtest (evidence against it 1, " in said
+    assert "no alarm" not in said
+
+
+@pytest.mark.parametrize(("rows", "annual"), [(1, False), (62, False), (63, True), (64, True)])
+def test_less_than_a_quarter_of_a_year_is_not_annualized(rows, annual):
+    band = (0.9, 1.0, 1.1)
+    found = following(np.append(np.linspace(10, 9, rows), 9.5), band).rows()["live"]
+    known = {name for name, value in found.items() if not np.isnan(value)}
+    always = {"growth", "drawdown"}
+    assert known == (always | {"a year", "volatility", "sharpe"} if annual else always)
+    assert found["growth"] == pytest.approx(-0.05)
+    assert all(np.isnan(x) for x in following([10.0], band).rows()["live"].values())
 
 
 def test_a_margin_call_is_said_while_it_lasts():

@@ -60,10 +60,7 @@ def print_following(following: "Following") -> None:
     forms = (".1%", ".1%", ".1%", ".2f", ".1%")
     print_table(
         ("net", "growth", "a year", "volatility", "Sharpe", "drawdown"),
-        [
-            (name, *map(figure, found.values() if found else [None] * len(forms), forms))
-            for name, found in following.rows().items()
-        ],
+        [(name, *map(figure, found.values(), forms)) for name, found in following.rows().items()],
     )
     for sentence in following.sentences():
         if sentence.startswith(URGENT):

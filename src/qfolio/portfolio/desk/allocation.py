@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import itertools
 import math
 from fractions import Fraction
 from functools import cached_property, partial
@@ -15,7 +16,7 @@ from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import Context, CostModel
 from qfolio.portfolio.desk.whole_shares import whole_shares as rounded
 from qfolio.portfolio.itemized import Itemized
-from qfolio.portfolio.mandate.limits import lots
+from qfolio.portfolio.mandate.limits import lots, parse
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.frequency import spacing
 from qfolio.portfolio.prices.table import Prices
@@ -58,6 +59,7 @@ class Allocation:
     trades: np.ndarray  # shares to buy, negative to sell
     costs: dict[str, float]  # expected, in money, by kind
     cash_after: float
+    order_costs: np.ndarray  # the same of each asset's order, all kinds together
 
     @staticmethod
     def of(
@@ -73,7 +75,8 @@ class Allocation:
         """The policy's target after the table's last row, and the trades from the current holding.
 
         The targets are scaled to the wealth after costs (the transaction remainder factor), so that
-        the trades never need more money than there is.
+        the trades never need more money than there is. Where the mandate fills orders over several
+        rows, costs are those of all parts, at the last row's prices.
 
         Args:
             policy: The policy or other strategy to follow.
@@ -117,10 +120,11 @@ class Allocation:
         trades = np.zeros(len(shares))
         conditions = Conditions.of(prices, policy.costs)
         context = context_of(policy.costs, conditions, len(prices) - 1, wealth)
-        after = partial(settled, policy.costs, context, held, wealth, shares, known)
+        parts = parse(policy.mandate)[1].trading.fill if policy.mandate else 1
+        after = partial(filled, policy.costs, context, shares, cash, known, parts)
         if not np.array_equal(weights, held):
             kept = abs(weights - held)[1:] <= NOISE
-            reached = _paid(policy.costs, context, held, weights, kept)
+            reached = _paid(policy.costs, context, held, weights, kept, parts)
             money = wealth * reached[1:]
             trades = np.divide(money, known, out=np.zeros_like(money), where=known > 0) - shares
             lot = lots(policy.mandate)
@@ -132,7 +136,13 @@ class Allocation:
                 ideal = wealth * reached[0]
                 trades = rounded(trades, shares, known, ideal, lambda trades: after(trades)[0], lot)
         cash_after, costs = after(trades) if trades.any() else (cash, {})
-        rounding = weights[0] >= 0 and cash_after > -1e-9 * wealth
+        own = np.zeros(len(trades))
+        for j in np.flatnonzero(trades).tolist():
+            own[j] = sum(after(np.where(np.arange(len(trades)) == j, trades, 0.0))[1].values())
+        if own.any():  # the wealth that one order's costs leave changes the others' a little
+            own *= sum(costs.values()) / own.sum()
+        # Equal parts of an order in shares are only nearly such of the way to its weights.
+        rounding = weights[0] >= 0 and cash_after > -NOISE * wealth
         return Allocation(
             date=day(prices.dates[-1]),
             assets=prices.assets,
@@ -143,6 +153,7 @@ class Allocation:
             trades=trades,
             costs=costs,
             cash_after=max(cash_after, 0.0) if rounding else cash_after,
+            order_costs=own,
         )
 
     @property
@@ -211,7 +222,12 @@ def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
 
 
 def _paid(
-    model: CostModel, context: Context, held: np.ndarray, weights: np.ndarray, kept: np.ndarray
+    model: CostModel,
+    context: Context,
+    held: np.ndarray,
+    weights: np.ndarray,
+    kept: np.ndarray,
+    parts: int,
 ) -> np.ndarray:
     """Cash and each asset after the costs of an order, as shares of the wealth before it.
 
@@ -220,12 +236,17 @@ def _paid(
     the costs, nothing is traded. Where there are debts, the rest may be worth little, or nothing,
     and cash pays for what is kept.
 
-    kept: whether an asset's weight is to stay, of shape (N,).
+    kept: whether an asset's weight is to stay, of shape (N,). parts: in which the order is filled.
     """
 
     def remains(before: np.ndarray, after: np.ndarray, share: float) -> float:
-        of_it = context._replace(wealth=share * context.wealth)
-        return float(model.trade(before / before.sum(), after / after.sum(), of_it)[0])
+        left = 1.0
+        path = np.linspace(before / before.sum(), after / after.sum(), parts + 1)
+        for start, end in itertools.pairwise(path):
+            if left > 0:
+                of_it = context._replace(wealth=left * share * context.wealth)
+                left *= float(model.trade(start, end, of_it)[0])
+        return left
 
     apart = np.append(False, kept)
     before, after = (np.where(apart, 0.0, each) for each in (held, weights))
@@ -250,6 +271,33 @@ def context_of(
     """The circumstances of a trade at a row, ``lag`` rows after its decision."""
     capital = model.capital if isinstance(model, Itemized) else wealth
     return known.trade(row, lag, wealth / capital)
+
+
+def filled(
+    model: CostModel,
+    context: Context,
+    shares: np.ndarray,
+    cash: float,
+    prices: np.ndarray,
+    parts: int,
+    trades: np.ndarray,
+) -> tuple[float, dict[str, float]]:
+    """The cash that is left after trades in equal parts, and their costs in money, by kind.
+
+    shares, cash: held before. parts: how many there are, all at the same prices.
+    """
+    part, paid = trades / parts, dict[str, float]()
+    first = wealth = float(shares @ prices + cash)
+    for _ in range(parts):
+        if wealth <= 0:  # costs have taken everything
+            break
+        now = context._replace(wealth=context.wealth * wealth / first)
+        held = np.append(cash, shares * prices) / wealth
+        cash, costs = settled(model, now, held, wealth, shares, prices, part)
+        paid = {kind: paid.get(kind, 0.0) + money for kind, money in costs.items()}
+        shares = shares + part
+        wealth = float(shares @ prices + cash)
+    return cash, paid
 
 
 def settled(

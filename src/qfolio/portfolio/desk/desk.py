@@ -22,6 +22,7 @@ from qfolio.portfolio.desk import notes
 from qfolio.portfolio.desk.allocated import Allocated
 from qfolio.portfolio.desk.allocation import Allocation, require_fresh
 from qfolio.portfolio.desk.drivers import reasons, sentence
+from qfolio.portfolio.desk.history import revisions
 from qfolio.portfolio.desk.holdings import cashed_out, read_holdings
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
 from qfolio.portfolio.desk.orders_csv import order_rows, replaced
@@ -44,15 +45,16 @@ SAME = 1e-6
 class Desk:
     """A run whose agents, baselines and strategies of the user's own are followed.
 
-    inspect: how prices are read, from the options of the command line. findings: what was found on
-    the table that was read last. delists: whether the user said that prices which end early are
-    those of delisted assets.
+    inspect: how prices are read, from the options of the command line. news: what was found on the
+    table that was read last and the backtest did not know: on later rows, and where its history is
+    another. delists: whether the user said that prices which end early are those of delisted
+    assets.
     """
 
     run: Backtest
     folder: Path
     inspect: Callable[..., tuple[Prices | None, list[Finding]]] = field(default=inspect)
-    findings: list[Finding] = field(default_factory=list)
+    news: list[Finding] = field(default_factory=list)
     delists: bool = False
 
     @staticmethod
@@ -145,13 +147,14 @@ class Desk:
 
         Raises:
             QfolioError: They cannot be read, are of other assets or another frequency, or those of
-                some asset end early.
+                some asset end early or are another's.
         """
         if prices is None:
             return self.run.prices
         read, findings = self.inspect(prices)
         table = accepted(read, findings, prices)
-        self.findings = findings
+        last = day(self.run.prices.dates[-1])
+        self.news = [found for found in findings if found.date and found.date > last]
         if table.members is None and self.run.prices.members is not None:
             raise QfolioError(
                 "The backtest's universe has members that change over time; give the latest "
@@ -167,6 +170,7 @@ class Desk:
                 )
         table = table.exactly(known.assets, "the backtest")
         require_alike(table.dates, known.periods_per_year, "the backtest has")
+        self.news = [*revisions(known, table), *self.news]
         self._require_last_prices(table)
         return table
 
@@ -188,12 +192,6 @@ class Desk:
         before = self.run.prices.listed
         there = True if before is None else before[-1]
         return np.flatnonzero(there & ~table.listed[-1]).tolist()
-
-    @property
-    def news(self) -> list[Finding]:
-        """The findings on those rows of the last table read that are later than the backtest's."""
-        last = day(self.run.prices.dates[-1])
-        return [found for found in self.findings if found.date and found.date > last]
 
     def allocate(
         self,
@@ -332,6 +330,8 @@ class Desk:
             said += notes.waiting(table, config.lag)
             said += notes.pending(table, config.lag, earlier, fills)
         said += notes.filled_over(trading.fill)
+        said += notes.dear(allocation)
+        said += notes.other_capital(allocation.wealth, followed.task.costs)
         return said + notes.budget(trading.turnover_a_year, spent, allocation)
 
     def record(

@@ -12,7 +12,7 @@ from qfolio.core.files import write_csv
 from qfolio.core.text import amount, figure
 from qfolio.portfolio.backtest.folder import BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
-from qfolio.portfolio.backtest.statistics.measures import log_growth, measures
+from qfolio.portfolio.backtest.statistics.measures import drawdown, log_growth, measures
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.desk import consistency
@@ -103,6 +103,8 @@ class Following:
             said.append(
                 f"WIPED OUT on {day(live.ruin)}: the account's debts exceeded what it owned."
             )
+        elif self.alarm is None and place:
+            said.append(f"There is no alarm yet: the backtest is not refuted ({level}).")
         elif self.alarm is None:
             said.append(f"Live returns are consistent with the backtest ({level}).")
         if self.alarm is not None:
@@ -151,7 +153,10 @@ class Following:
         return why + [f"its age of {self.test} or more, the backtest's test length"] * self.overdue
 
     def rows(self) -> dict[str, dict[str, float]]:
-        """Growth in all and per year, volatility, Sharpe ratio and maximum drawdown, by name."""
+        """Growth in all and per year, volatility, Sharpe ratio and maximum drawdown, by name.
+
+        What cannot be said of so few rows is NaN.
+        """
         year = self.periods_per_year
         return {
             "live": _measures(self.live.returns, self.cash, year),
@@ -278,12 +283,14 @@ def _earned_by_cash(table: Prices, costs: CostModel, first: int, count: int) -> 
 
 
 def _measures(returns: np.ndarray, cash: np.ndarray, year: float) -> dict[str, float]:
-    if len(returns) < 2:
-        return {}
-    free = np.zeros(len(returns))
-    found = measures(returns, free, free, year, cash)
-    return {
-        "growth": float(np.expm1(log_growth(returns).sum())),
-        "a year": float(found["growth"]),
-        **{name: float(found[name]) for name in ("volatility", "sharpe", "drawdown")},
-    }
+    """The measures that some returns allow; the annual ones are NaN below a quarter of a year."""
+    found = dict.fromkeys(("growth", "a year", "volatility", "sharpe", "drawdown"), np.nan)
+    if len(returns):
+        found["growth"] = float(np.expm1(log_growth(returns).sum()))
+        found["drawdown"] = float(drawdown(returns).max())
+    if len(returns) >= max(2, year / 4):
+        none = np.zeros(len(returns))
+        annual = measures(returns, none, none, year, cash)
+        found["a year"] = float(annual["growth"])
+        found |= {name: float(annual[name]) for name in ("volatility", "sharpe")}
+    return found

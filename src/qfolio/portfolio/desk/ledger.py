@@ -26,6 +26,9 @@ FORMAT = 1
 FEES = 0.05
 """How far cash may be from what a record expects after its trades, as a share of what they move."""
 
+DECIDES = frozenset({"agent", "policy", "settings"})
+"""The inputs that decide; others, such as prices that were adjusted again, want about the same."""
+
 # Names become paths.
 PolicyName = Annotated[str, msgspec.Meta(pattern=r"^latest(-[0-9]+)?$")]
 
@@ -146,7 +149,7 @@ class Ledger:
             before = next((r for r in reversed(records) if r.date == content["date"]), None)
             if before is not None and not (differing := _differing(before, content)):
                 return before, f"This allocation is already record {before.number} of the ledger."
-            if before is not None and differing == ["holdings"] and _traded(before, content):
+            if before is not None and _traded(before, content) and DECIDES.isdisjoint(differing):
                 raise QfolioError(
                     f"The holdings are those of record {before.number} of {before.date} after its "
                     "trades, so that nothing more is ordered on these prices; allocate on later "

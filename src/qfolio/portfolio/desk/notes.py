@@ -10,13 +10,22 @@ from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.baselines.base import window_rows
 from qfolio.portfolio.backtest.folds import latest
 from qfolio.portfolio.calendars import band, decision_rows
+from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.desk.allocation import NOISE, Allocation
 from qfolio.portfolio.desk.ledger import Record
 from qfolio.portfolio.desk.untrained import Ordered, Rule, Untrained
+from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.policy import UNKNOWN, Policy
 from qfolio.portfolio.prices.findings import day, first_of
 from qfolio.portfolio.prices.frequency import spacing
 from qfolio.portfolio.prices.table import Prices
+
+DEAR = 0.02
+"""Share of the value traded from which on a cost is remarkable."""
+
+FAR = 5.0
+"""Factor between an account and the backtest's capital from which on costs that depend on wealth
+say little about the account's."""
 
 SLOW = 6.0
 """Days between the rows of a table from which on a lag of one is no longer the next day."""
@@ -182,9 +191,32 @@ def filled_over(rows: int) -> list[str]:
     if rows == 1:
         return []
     return [
-        f"The mandate fills orders over {rows} rows: trade an equal part of each "
-        "order at each of these rows. The expected cost assumes a single trade; fees per "
-        "trade and market impact will differ."
+        f"The mandate fills orders over {rows} rows: trade an equal part of each order at each of "
+        "these rows. The expected cost is that of all parts, each with its own fees."
+    ]
+
+
+def dear(allocation: Allocation) -> list[str]:
+    """Says so if the expected cost is a large part of what is traded."""
+    moved = float(np.nansum(abs(allocation.trades * allocation.prices)))
+    if not allocation.cost > DEAR * moved:
+        return []
+    return [
+        f"The expected cost is {allocation.cost / moved:.1%} of the value traded, "
+        f"{moved:,.2f}: fees weigh less on larger orders, and market impact on smaller ones."
+    ]
+
+
+def other_capital(wealth: float, costs: CostModel) -> list[str]:
+    """Says so if an account is far from the capital on which the backtest's costs depend."""
+    if not isinstance(costs, Itemized) or not costs.depends_on_wealth:
+        return []
+    if 1 / FAR < wealth / costs.capital < FAR:
+        return []
+    return [
+        f"The account is worth {wealth:,.2f}, but the backtest began with a capital of "
+        f"{costs.capital:,.0f}, on which its costs depend; to learn what they leave of such an "
+        f"account, run it with capital={wealth:.0f} in --cost-model."
     ]
 
 

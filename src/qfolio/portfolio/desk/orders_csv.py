@@ -60,15 +60,13 @@ def replaced(path: Path, header: list[str], rows: Rows) -> Iterator[None]:
 
 
 def _generic(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
-    """Market orders, with the weights and a share of the cost in proportion to the value traded."""
+    """Market orders, each with its weights and its expected cost."""
     header = [
         "date", "symbol", "side", "quantity", "order_type", "price", "notional", "weight_before",
         "weight_after", "expected_cost",
     ]  # fmt: skip
-    orders = _orders(allocation)
-    total = sum(abs(allocation.trades[i] * allocation.prices[i]) for i, *_ in orders)
     rows = []
-    for i, side, quantity in orders:
+    for i, side, quantity in _orders(allocation):
         price = float(allocation.prices[i])
         rows.append(
             [
@@ -81,7 +79,7 @@ def _generic(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
                 round(quantity * price, 2),
                 round(float(allocation.held[1 + i]), 6),
                 round(float(allocation.reached[1 + i]), 6),
-                round(allocation.cost * abs(allocation.trades[i]) * price / total, 2),
+                round(float(allocation.order_costs[i]), 2),
             ]
         )
     return header, rows

@@ -33,9 +33,9 @@ HEADINGS = {
 }
 
 _MEASURED: dict[Measured, str] = {
-    "growth": "Log growth",
-    "sharpe": "Sharpe",
-    "volatility": "Volatility",
+    "growth": "Log growth less",
+    "sharpe": "Sharpe less",
+    "volatility": "Volatility relative to",
 }
 
 RELATIVE_HEADINGS = {
@@ -124,7 +124,7 @@ def difference_headings(data: BacktestData) -> list[str]:
     """The column headings of ``difference_rows``."""
     test = data.assessment
     return [
-        f"{_MEASURED[key]} less {name}{remark}"
+        f"{_MEASURED[key]} {name}{remark}"
         for _, name, remark, keys in _comparisons(test)
         for key in keys
     ]

@@ -67,7 +67,8 @@ def test_the_corrected_p_value_decides(assessment: Assessment) -> None:
         "No evidence that dqn beats equal weight in growth, Sharpe ratio or volatility after "
         "costs: the difference in annual growth from it is +0.8% (95% interval +0.1% to +3.4%; "
         "corrected p = 0.051), in Sharpe ratio 0.00 (95% interval -0.10 to +0.10; corrected "
-        "p = 1.00) and in volatility 0.0% (95% interval -9.5% to +10.5%; corrected p = 1.00)."
+        "p = 1.00) and in volatility 0.0% of it's (95% interval -9.5% to +10.5%; corrected "
+        "p = 1.00)."
     ]
     single = dataclasses.replace(assessment, comparisons=1)
     assert "to +3.4%; p = 0.051)" in said(single, None, taken_away)[0]
@@ -163,7 +164,7 @@ def test_digits_tell_an_end_from_zero(assessment: Assessment) -> None:
     (same,) = said(assessment, None, about(growth=rounding, sharpe=rounding, volatility=rounding))
     assert same.count("is 0.0% (95% interval 0.0% to 0.0%;") == 1
     assert "in Sharpe ratio 0.00 (95% interval 0.00 to 0.00;" in same
-    assert "in volatility 0.0% (95% interval 0.0% to 0.0%;" in same
+    assert "in volatility 0.0% of it's (95% interval 0.0% to 0.0%;" in same
 
 
 UNKNOWN = Contrast(-math.inf, (-math.inf, math.inf), 1.0, 1.0, "none")
@@ -177,7 +178,7 @@ def test_an_interval_without_ends_is_said_as_such(assessment: Assessment) -> Non
         (sentence,) = said(assessment, None, about(growth=nowhere, sharpe=nowhere, volatility=wide))
         assert "in annual growth from it is 0.0% (95% interval -∞% to +∞%;" in sentence
         assert "in Sharpe ratio 0.00 (95% interval -∞ to +∞;" in sentence
-        assert "in volatility 0.0% (95% interval -100.0% to +∞%;" in sentence
+        assert "in volatility 0.0% of it's (95% interval -100.0% to +∞%;" in sentence
 
 
 def test_a_total_loss_is_said_without_numbers(assessment: Assessment) -> None:
@@ -224,7 +225,7 @@ def test_nothing_is_times_as_volatile_as_cash(assessment: Assessment) -> None:
         "fluctuates."
     )
     twice = about("cash", volatility=contrast("worse", math.log(2)))
-    assert "in volatility +100.0%" in said(assessment, None, twice)[0]
+    assert "in volatility +100.0% of cash's (95%" in said(assessment, None, twice)[0]
 
 
 def test_one_reference_needs_one_sentence(assessment: Assessment) -> None:

@@ -171,7 +171,7 @@ def evidence(difference: Difference, assessment: Assessment) -> str:
             if not texts:
                 what = "annual growth" if key == "growth" else _MEASURES[key]
                 lead = f"the difference in {what} from {difference.reference} is"
-            texts.append(f"{lead} {_numbers(key, each, p)}")
+            texts.append(f"{lead} {_numbers(key, each, p, difference.reference)}")
     if not texts:
         return ""
     steady = "volatility" in tested and difference.volatility.value > math.log(STEADY)
@@ -209,14 +209,15 @@ def telling(value: float, digits: int) -> int:
     return next((d for d in range(digits, 5) if round(value, d)), digits)
 
 
-def _numbers(key: Measured, contrast: Contrast, p: str) -> str:
-    """A difference with its interval and p-value in words."""
+def _numbers(key: Measured, contrast: Contrast, p: str, other: str) -> str:
+    """A difference from another strategy, with its interval and p-value in words."""
     percent, unit = key != "sharpe", "%" if key != "sharpe" else ""
     least = 1 if percent else 2
     scaled = [100 * value if percent else value for value in shown(key, contrast)]
     digits = max(telling(end, least) for end in scaled[1:])
     middle, left, right = (f"{_number(value, digits, sign=True)}{unit}" for value in scaled)
-    text = f"{middle} (95% interval {left} to {right}"
+    base = f" of {other}'s" if key == "volatility" else ""
+    text = f"{middle}{base} (95% interval {left} to {right}"
     return text + (")" if contrast.p_holm is None else f"; {p} {p_text(contrast.p_holm)})")
 
 
