@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import json
 import sys
+from typing import Any
 
 import gymnasium
 import jax
@@ -162,7 +163,8 @@ class Faulty(Tiny):
             if self.fault == "old interface":
                 return seen, reward, False, {}
             seen = {"NaN": seen * np.nan, "longer": np.ones(3), "number": 1.0}.get(self.fault, seen)
-            reward = {"no reward": np.nan}.get(self.fault, reward)
+            rewards: dict[str, Any] = {"no reward": np.nan, "rewards": np.ones(1)}
+            reward = rewards.get(self.fault, reward)
         return seen, reward, False, False, {}
 
 
@@ -430,6 +432,7 @@ def test_it_says_what_is_wrong(make, message):
     [
         ("NaN", "step 2 of an episode: its observation is not finite"),
         ("no reward", "step 2 of an episode: its reward is not finite"),
+        ("rewards", r"step 2 of an episode: its reward has the shape \(1,\); it must be one num"),
         ("starts with NaN", "the start of an episode: its observation is not finite"),
         ("longer", r"step 2 .* has the shape \(3,\) and its observation space \(2,\)"),
         ("number", r"step 2 .* has the shape \(\) and its observation space \(2,\)"),

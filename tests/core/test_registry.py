@@ -69,6 +69,8 @@ def test_a_class_in_the_current_directory(own):
         ("task", "own_parts:Half", "is not complete: it lacks actions, horizon, observe, step"),
         ("reward", "own_parts:Flat",
          "Flat.__call__ must be a method that takes self, state and outcome."),
+        ("task", "own_parts:make.<locals>.Mine",
+         r"a class within a function, .*, or pass the task, as in .*Run.open\(folder, task=…"),
         ("task", "elsewhere:Mine", "a module elsewhere is neither installed nor in this folder"),
         ("task", "broken_parts:Mine", r"broken_parts cannot be imported: AttributeError: .*"
                                       r"\(broken_parts.py, line 3\)"),

@@ -1,7 +1,11 @@
 import dataclasses
+import json
 import math
 import re
+from typing import Any
 
+import jax
+import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
@@ -9,7 +13,9 @@ from qfolio.agents.sac import SAC
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, static
+from qfolio.core.population import Population
 
+from populations import assert_same, train_to
 from probes import OneState, Probe
 
 
@@ -110,6 +116,56 @@ def test_counts_shape_the_program():
 
     with pytest.raises(QfolioError, match=r"size of Careless .*; declare it as size: int = static"):
         Careless()
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "says"),
+    [
+        (str, "a", r"is text, which shapes the program; declare it as part: str = static\(…\)"),
+        (bool, True, r"is true or false, which .*; declare it as part: bool = static\(…\)"),
+        (Any, "a", r"is of type str, which .*; declare it as part: .*Any = static\(…\)"),
+        (dict, {"sign": abs}, r"is of type builtin_function_or_method, which shapes the program"),
+    ],
+)
+def test_what_is_no_number_shapes_the_program(kind, value, says):
+    with pytest.raises(QfolioError, match=f"^part of Own {says}"):
+        type("Own", (OneState,), {"__annotations__": {"part": kind}, "part": part(value)})()
+
+
+def part(value):
+    return dataclasses.field(default_factory=lambda: value)
+
+
+def test_a_default_may_be_a_number_of_numpy():
+    class Own(OneState):
+        size: int = static(np.int64(3))
+        share: float = number(np.float64(0.5))
+
+    assert type(Own().share) is float
+    described = settings.describe(Own())
+    assert json.loads(json.dumps(described)) == {"horizon": 1, "size": 3, "share": 0.5}
+
+
+class Composed(DQN):
+    """Learns as a DQN that is made anew, or changed, within the program."""
+
+    share: float = number(0.5)
+    anew: bool = static(True)
+
+    def learn(self, task, state, rollout, key):
+        rate = self.learning_rate * self.share
+        if self.anew:
+            chosen: Any = {name: getattr(self, name) for name in settings.names(DQN)}
+            return DQN(**{**chosen, "learning_rate": rate}).learn(task, state, rollout, key)
+        return DQN.learn(dataclasses.replace(self, learning_rate=rate), task, state, rollout, key)
+
+
+@pytest.mark.parametrize("anew", [True, False])
+def test_agents_can_be_made_within_a_program(anew):
+    small: Any = {"hidden": (4,), "batch_size": 4, "learning_starts": 4}
+    agents = [Composed(**small, learning_rate=0.01, anew=anew), DQN(**small, learning_rate=0.005)]
+    composed, plain = (train_to(Population(OneState(), agent, [0]), 50) for agent in agents)
+    assert_same(jax.tree.leaves(composed.weights()), jax.tree.leaves(plain.weights()))
 
 
 def test_settings_are_divided_by_their_owners():

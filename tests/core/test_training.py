@@ -12,14 +12,15 @@ from qfolio.agents.ppo import PPO
 from qfolio.core.contract import learning_of
 from qfolio.core.devices import Members, configure
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number
+from qfolio.core.fields import number, static
 from qfolio.core.mdp import Step
 from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin, chunk_steps
 
 import probes
+from planted import Known
 from populations import assert_same, stored, train_to
-from probes import Endless, Explosive, RewardDelay
+from probes import Endless, Explosive, OneState, Probe, RewardDelay
 
 
 def trained(task, agent, seeds, steps):
@@ -119,6 +120,46 @@ def test_restoring_goes_on_bit_for_bit(task, agent):
     assert_same(second.fetch(), straight.fetch())
 
 
+class Drawn(OneState):
+    """Its state has a random key."""
+
+    horizon: int = static(3)
+
+    def reset(self, key):
+        return key
+
+    def step(self, state, action, key):
+        return Step(key, jax.random.uniform(state), jnp.array(False))
+
+
+class Drawing(Known):
+    """Its state has a random key."""
+
+    def init(self, task, key):
+        return {"key": key, "weights": jnp.zeros(())}
+
+    def act(self, state, observation, key):
+        return jax.random.randint(state["key"], (self.num_envs,), 0, 2)
+
+    def learn(self, task, state, rollout, key):
+        return {"key": key, "weights": state["weights"] + rollout.reward.sum()}, {}
+
+    def weights(self, state):
+        return state["weights"]
+
+    def policy(self, weights, observation):
+        return jnp.zeros(len(observation), jnp.int32)
+
+
+def test_states_may_hold_random_keys():
+    first, _ = trained(Drawn(), Drawing(), [0, 1], [7])
+    second = Population(Drawn(), Drawing(), [0, 1])
+    second.restore(first.fetch())
+    straight, _ = trained(Drawn(), Drawing(), [0, 1], [20])
+    assert_same(train_to(second, 20).fetch(), straight.fetch())
+    assert second.weights()[0] != second.weights()[1]
+
+
 def test_transitions_end_before_the_reset():
     """The buffer of a task whose every transition is known: 0 → 1 → end."""
     agent = DQN(
@@ -214,9 +255,35 @@ class Uncounted(RewardDelay):
         return state.astype(int)
 
 
+class Torn(Probe):
+    """From time to time it pays nothing at all."""
+
+    horizon: int = static(5)
+    reset, observe = OneState.reset, OneState.observe
+
+    def step(self, state, action, key):
+        reward = jnp.where(jax.random.bernoulli(key, 0.01), jnp.nan, 1.0)
+        return Step(state, reward, jnp.array(False))
+
+
+class Flickering(Probe):
+    """From time to time it shows nothing at all."""
+
+    horizon: int = static(5)
+    reset = OneState.reset
+
+    def observe(self, state):
+        return jnp.where(state > 0.99, jnp.nan, state)[None]
+
+    def step(self, state, action, key):
+        return Step(jax.random.uniform(key), 1.0 * action, jnp.array(False))
+
+
 @pytest.mark.parametrize(
     ("task", "changes", "says"),
     [
+        (Torn(), {}, "With seed 4, the reward of Torn is not finite at step . of an episode; ch"),
+        (Flickering(), {}, "the observation of Flickering is not finite after step . of an episod"),
         (Uncounted(), {}, "observation of Uncounted is not from 0 to 0 after step 1"),
         (Endless(), {"learning_rate": 1e30}, "loss of seed 4, 5 is no longer finite"),
         (Explosive(), {}, "reward of Explosive is not finite at step 42 of an episode"),

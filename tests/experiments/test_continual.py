@@ -273,7 +273,8 @@ def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
     folder = tmp_path / "there"
     words = ["continual", "pendulum", "--change", "mass=1.5", "--episodes", 8, "--seeds", 2]
     with monkeypatch.context() as stopping:
-        stopping.setattr(BarProgress, "on_chunk", Interrupt().on_chunk)
+        stop = Interrupt().on_chunk
+        stopping.setattr(BarProgress, "on_chunk", lambda self, *chunk: stop(*chunk))
         assert qfolio(monkeypatch, *words, "--out", folder, *TINY) == 130
     said = f"Resume with: qfolio continual --resume {folder}"
     assert capsys.readouterr().out.splitlines()[-1].endswith(said)

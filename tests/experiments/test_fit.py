@@ -7,7 +7,7 @@ from qfolio.experiments.fit import Listener, require_listeners
 
 
 class Short(Listener):
-    def on_chunk(self, training):
+    def on_chunk(self, training):  # type: ignore[override]
         """Takes no rows."""
 
 

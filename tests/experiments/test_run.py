@@ -7,27 +7,34 @@ import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
 import qfolio.core.files
+from qfolio.agents.ddpg import DDPG
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.agents.tabular import QLearning
 from qfolio.core.errors import QfolioError
+from qfolio.core.fields import static
 from qfolio.core.files import write_arrays
+from qfolio.core.mdp import Discrete, Step, Task
 from qfolio.core.text import four_digits
 from qfolio.experiments.budget import Budget
+from qfolio.experiments.described import OTHERS, recorded
+from qfolio.experiments.grading import curve_optimum
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.kelly import Kelly
-from qfolio.tasks.finite import Cliff
+from qfolio.tasks.finite import Cliff, FiniteMDP
 
 from listeners import Interrupt, Tell
-from probes import Explosive
+from probes import Aim, Explosive, OneState, RewardDelay
 
 
 def create(task, agent, folder, episodes=12, **options):
@@ -81,6 +88,80 @@ def test_a_run_is_opened_with_what_it_was_trained_with(task, agent, tmp_path):
         Run.open(tmp_path / "run", agent=other)
     with pytest.raises(QfolioError, match=r"task is .market/ar1., but .* was trained with"):
         Run.open(tmp_path / "run", task=Ar1())
+
+
+class Bandit(OneState):
+    """Pays the number that an action chooses from an array."""
+
+    pay: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0.0, 1.0]))
+
+    def step(self, state, action, key):
+        return Step(state, jnp.asarray(self.pay)[action], jnp.array(True))
+
+
+class Wrapped(Task):
+    """Another task, of which it is a copy."""
+
+    inner: Task = RewardDelay()
+    horizon: int = static(2)
+
+    @property
+    def actions(self):
+        return self.inner.actions
+
+    def reset(self, key):
+        return self.inner.reset(key)
+
+    def observe(self, state):
+        return self.inner.observe(state)
+
+    def step(self, state, action, key):
+        return self.inner.step(state, action, key)
+
+
+@pytest.mark.parametrize(
+    ("made", "other", "default", "field"),
+    [
+        (lambda: Bandit(pay=np.array([5.0, 1.0])), Bandit(pay=np.array([5.0, 2.0])), Bandit(),
+         "pay"),
+        (lambda: Wrapped(inner=Aim(bound=3.0)), Wrapped(inner=Aim(bound=4.0)), Wrapped(), "inner"),
+        (lambda: Wrapped(inner=Bandit(pay=np.array([5.0, 1.0]))), Wrapped(inner=Bandit()),
+         Wrapped(), "inner"),
+    ],
+)  # fmt: skip
+def test_a_field_that_no_folder_holds_is_not_replaced(made, other, default, field, tmp_path):
+    """Neither by its default nor by another that is given."""
+    agent = DQN(hidden=(4,)) if made().actions == Discrete(2) else DDPG(hidden=(4,))
+    create(made(), agent, tmp_path / "run")
+    with pytest.raises(QfolioError, match=rf"{field} of the task .* is no setting, .*\(folder, ta"):
+        Run.open(tmp_path / "run")
+    with pytest.raises(
+        QfolioError, match=f"{field} of the task is not what the folder was trained"
+    ):
+        Run.open(tmp_path / "run", task=other)
+    Run.open(tmp_path / "run", task=made())
+    create(default, DQN(hidden=(4,)), tmp_path / "default")
+    Run.open(tmp_path / "default")
+    with pytest.raises(
+        QfolioError, match=f"{field} of the task is not what the folder was trained"
+    ):
+        Run.open(tmp_path / "default", task=other)
+
+
+def test_a_folder_that_says_nothing_of_an_array_is_opened(tmp_path):
+    """As folders of earlier versions do."""
+    task = Bandit(pay=np.array([5.0, 1.0]))
+    create(task, DQN(hidden=(4,)), tmp_path / "run")
+    file = tmp_path / "run" / "config.json"
+    config = json.loads(file.read_text())
+    assert config["task_settings"].pop(OTHERS).keys() == {"pay"}
+    file.write_text(json.dumps(config))
+    assert Run.open(tmp_path / "run", task=task).task is task
+
+
+def test_tables_that_follow_from_settings_are_not_recorded():
+    assert OTHERS not in recorded(Cliff())
+    assert OTHERS in recorded(FiniteMDP(np.ones((1, 1, 1)), np.ones((1, 1))))
 
 
 @pytest.mark.parametrize("starts", [0, -1, 10**9])
@@ -396,6 +477,46 @@ def test_there_is_no_share_of_an_optimum_of_zero(tmp_path):
     summary = train(task, agent, episodes=8, seeds=2, out=tmp_path / "run").summary()
     assert (summary["optimum"], summary["regret_per_seed"]) == (0.0, None)
     assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
+
+
+class Solved(OneState):
+    """Its optimum is what a test says."""
+
+    solution: Any = static(None)
+
+    def optimum(self):
+        return self.solution
+
+
+class Returns:
+    """An optimum."""
+
+    def __init__(self, returns):
+        self.returns = returns
+
+
+@pytest.mark.parametrize(
+    ("solution", "says"),
+    [
+        (3.0, r"^Solved.optimum\(\) is 3.0; it must be None, or an object with a method returns."),
+        (Returns(lambda keys: np.zeros(3)), r"returns gives float64\[3\]; it must give a finite n"),
+        (Returns(lambda keys: 3.0), r"returns gives float64\[\]; it must give a finite number for"),
+        (Returns(lambda keys: ["a"] * len(keys)), r"returns gives <U1\[.*\]; it must give a fini"),
+        (Returns(lambda keys: np.full(len(keys), np.nan)), "gives numbers that are not finite; it"),
+    ],
+)  # fmt: skip
+def test_an_optimum_that_gives_no_returns_is_refused(solution, says):
+    run = Run.create(Solved(solution=solution), DQN(hidden=(4,)), episodes=1)
+    with pytest.raises(QfolioError, match=says):
+        curve_optimum(run.population)  # which commands ask for before they train
+    with pytest.raises(QfolioError, match=says):
+        run.grade()
+
+
+def test_an_optimum_of_ones_own_is_that_of_the_grade():
+    task = Solved(solution=Returns(lambda keys: [0.5] * len(keys)))
+    grade = Run.create(task, DQN(hidden=(4,)), episodes=1).grade()
+    assert grade["optimum"] == 0.5
 
 
 def spoil_checkpoint(folder, how):

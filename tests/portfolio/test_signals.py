@@ -142,6 +142,11 @@ class Whole(signals.Signal):
         return prices - prices[-1:] if len(prices) > 50 else prices
 
 
+class Drawn(signals.Signal):
+    def measure(self, prices, rows):
+        return np.random.default_rng().normal(size=prices.shape)
+
+
 class Silent(signals.Signal):
     def measure(self, prices, rows):
         with np.errstate(divide="ignore"):
@@ -227,6 +232,7 @@ def test_the_names_alone_need_lengths_that_can_be_read():
         (Filled(), "Filled looks ahead"),
         (Standardized(), "Standardized looks ahead"),
         (Whole(), "Whole looks ahead"),
+        (Drawn(), "Drawn has other values each time it is computed on the same table; draw its"),
         (Silent(), "Silent is unknown at each row and for each asset"),
         (Short(), "shape"),
         (Words(), "The signal Words returns 'up'; it must return an array of numbers."),

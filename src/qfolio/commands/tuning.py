@@ -220,11 +220,12 @@ def _conclude(work: "Tuning", resume: str, executor: "Executor") -> Document:
 
 def command(work: "Tuning", values: dict[str, Any]) -> str:
     """The command line that trains a configuration."""
+    from qfolio.experiments.described import plain
     from qfolio.experiments.presets import preset
 
     config = work.config
     base = preset(config.preset, config.task, config.agent)
     default = base.described(type(work.task))
-    chosen = settings.describe(work.configured(values)) | config.task_settings
+    chosen = settings.describe(work.configured(values)) | plain(config.task_settings)
     changed = {name: value for name, value in chosen.items() if value != default.get(name)}
     return training_command(config, config.preset, changed)

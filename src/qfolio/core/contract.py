@@ -16,10 +16,13 @@ from jaxtyping import PRNGKeyArray, PyTree
 from qfolio.core.arrays import numbers
 from qfolio.core.errors import QfolioError, require_methods, require_type, require_whole
 from qfolio.core.mdp import Actions, Agent, Box, Discrete, ExogenousTask, Step, Task, Transition
-from qfolio.core.text import amount
+from qfolio.core.text import amount, csv_cell
 
 SHOWN = 200
 """Most characters of a message that show what a method returned."""
+
+RESERVED = ("seed", "episode", "env_steps", "return", "greedy return", "overestimation")
+"""Names that the records of a training already have."""
 
 NUMBER: Any = jax.ShapeDtypeStruct((), jnp.float32)
 TRUTH: Any = jax.ShapeDtypeStruct((), jnp.bool_)
@@ -89,12 +92,16 @@ def require_agent(
         raise _refused(agent, "learn", learned, "the next state, and a dict of metrics")
     _require_like(agent, "learn", learned[0], state, " as state", "init")
     _require_metrics(agent, "learn", learned[1])
-    _require_metrics(agent, "monitor", _shapes(agent, "monitor", state))
+    monitored = _shapes(agent, "monitor", state)
+    _require_metrics(agent, "monitor", monitored)
     measured = _shapes(agent, "measure", step, of=(task,))
     _require_metrics(agent, "measure", measured)
+    _require_apart(task, agent, learn=learned[1], monitor=monitored, measure=measured)
     weights = _shapes(agent, "weights", state)
     if not jax.tree.leaves(weights):
         raise _refused(agent, "weights", weights, "an array, or several")
+    if any(jnp.issubdtype(x.dtype, jax.dtypes.prng_key) for x in jax.tree.leaves(weights)):
+        raise _refused(agent, "weights", weights, "arrays of numbers, without random keys")
     starts = _repeated(step, agent.num_envs + 1)  # an evaluation has batches of another size
     chosen = _shapes(agent, "policy", weights, starts.observation)
     _require_like(agent, "policy", chosen, starts.action)
@@ -221,9 +228,32 @@ def _require_like(
 
 
 def _require_metrics(owner: object, name: str, found: Any) -> None:
-    """Raises QfolioError unless metrics are named scalars."""
+    """Raises QfolioError unless metrics are scalars, with names that records can hold."""
     if not isinstance(found, dict) or any(getattr(x, "shape", 1) for x in found.values()):
         raise _refused(owner, name, found, "a dict of names and scalars", " as metrics")
+    for metric in found:
+        said = f"{type(owner).__name__}.{name} returns the metric {metric!r}"
+        if metric in RESERVED:
+            raise QfolioError(f"{said}, a name that the records already have; rename it.")
+        text = isinstance(metric, str) and metric.strip() and metric.isprintable()
+        if not text or csv_cell(metric) != metric:
+            raise QfolioError(
+                f"{said}; a name must be text that no spreadsheet reads as a formula."
+            )
+
+
+def _require_apart(task: Task, agent: Agent, **metrics: dict[str, Any]) -> None:
+    """Raises QfolioError if two methods name a metric alike; metrics: by the method's name."""
+    owners: dict[str, str] = {}
+    for method, found in metrics.items():
+        of_task = method == "measure" and type(agent).measure is Agent.measure
+        place = f"{type(task if of_task else agent).__name__}.{method}"
+        for name in found:
+            if name in owners:
+                raise QfolioError(
+                    f"{owners[name]} and {place} both return a metric {name!r}; rename one of them."
+                )
+            owners[name] = place
 
 
 def _refused(owner: object, name: str, found: PyTree, wanted: str, place: str = "") -> QfolioError:

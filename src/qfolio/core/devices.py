@@ -184,7 +184,7 @@ class Members:
 
     def fetch(self, tree: Any) -> Any:
         """Leaves on the devices, as numpy arrays with a leading member axis."""
-        return jax.tree.map(lambda x: np.asarray(x)[self._slots], tree)
+        return jax.tree.map(lambda x: unkeyed(x)[self._slots], tree)
 
     def compile(
         self,
@@ -227,6 +227,22 @@ class Members:
             if "INVALID_ARGUMENT" not in str(error):
                 raise
             return lowered.compile()  # this version of XLA has no such option
+
+
+def unkeyed(leaf: Any) -> np.ndarray:
+    """A leaf as an array of numpy, which has no random keys: those become their numbers."""
+    return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+
+
+def keyed(tree: Any, like: Any) -> Any:
+    """A tree whose numbers become random keys again where ``like`` has keys."""
+    wrap = jax.random.wrap_key_data
+    again = lambda x, old: wrap(x, impl=jax.random.key_impl(old)) if _is_key(old) else x  # noqa: E731
+    return jax.tree.map(again, tree, like)
+
+
+def _is_key(leaf: Any) -> bool:
+    return isinstance(leaf, Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _map(function: Callable[[Any], Any], members: Any, count: Array) -> Any:

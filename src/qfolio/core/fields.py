@@ -6,11 +6,16 @@ from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
+import jax
+import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.settings import SCALARS, converted
 
 T = TypeVar("T")
+
+FIXED = {"int": "a whole number", "bool": "true or false", "str": "text"}
+"""Types of settings that shape the program, by name, and what these are called."""
 
 
 def static(default: Any) -> Any:
@@ -39,16 +44,19 @@ def numbers(*default: float) -> Any:
 
 
 def _field(default: Any, kind: Any = None, *, static: bool = False) -> Any:
-    """A setting that takes the values that ``settings.converted`` takes.
+    """A setting that takes the values that ``settings.converted`` takes, and those of a program.
 
     kind: its type (default: the annotation; values of other types than ``SCALARS`` are not judged).
     """
 
     def convert(value: Any) -> Any:
         wanted = kind or SCALARS.get(getattr(field.type, "__name__", field.type))
-        judged = wanted is not None and value is not field.default  # repr leaves defaults out
-        return converted(field.name, wanted, value) if judged else value
+        if wanted is None or value is field.default or isinstance(value, jax.core.Tracer):
+            return value  # repr leaves defaults out
+        return converted(field.name, wanted, value)
 
+    if isinstance(default, np.generic):
+        default = default.item()  # as JSON has it
     field = eqx.field(converter=convert, static=static, default=default)
     return field
 
@@ -91,18 +99,22 @@ def require_counts(instance: Any, names: str, least: int = 1) -> None:
 
 
 def require_static(instance: Any) -> None:
-    """Raises QfolioError if an integer setting is not ``static``, or a default is not declared.
+    """Raises QfolioError if a setting is not ``static`` but has to be, or a default is undeclared.
 
-    Integers are counts, and counts shape the compiled program. A subclass that gives an inherited
-    setting a value without its type would change nothing.
+    Integers are counts, and counts shape the compiled program, as do words and choices; it takes
+    only numbers and arrays. A subclass that gives an inherited setting a value without its type
+    would change nothing.
     """
     name = type(instance).__name__
     for field in dataclasses.fields(instance):
-        fixed, kind = field.metadata.get("static"), getattr(field.type, "__name__", field.type)
-        if kind == "int" and not fixed:
+        fixed, kind = field.metadata.get("static"), str(getattr(field.type, "__name__", field.type))
+        leaves = [] if fixed else jax.tree.leaves(getattr(instance, field.name))
+        others = [type(leaf).__name__ for leaf in leaves if not eqx.is_array_like(leaf)]
+        if not fixed and (kind in FIXED or others):
             raise QfolioError(
-                f"{field.name} of {name} is a whole number, which shapes the program; declare it "
-                f"as {field.name}: int = static(…), from qfolio.core.fields."
+                f"{field.name} of {name} is {FIXED.get(kind) or f'of type {others[0]}'}, which "
+                f"shapes the program; declare it as {field.name}: {kind} = static(…), from "
+                "qfolio.core.fields."
             )
         first = next((each for each in type(instance).__mro__ if field.name in vars(each)), None)
         if first and field.name not in inspect.get_annotations(first):

@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from qfolio.core.devices import effort
+from qfolio.core.devices import effort, keyed, unkeyed
 from qfolio.core.errors import QfolioError, one_line
 from qfolio.core.evaluation import Greedy
 from qfolio.core.mdp import Agent, Task, Transition
@@ -136,7 +136,12 @@ class Environments:
                         f"its step returned {len(result)} values; wanted are observation, reward, "
                         "terminated, truncated and info"
                     )
-                observation, reward[i], terminated[i], truncated[i], _ = result
+                observation, paid, terminated[i], truncated[i], _ = result
+                if not isinstance(paid, float) and np.shape(paid):
+                    raise QfolioError(
+                        f"its reward has the shape {np.shape(paid)}; it must be one number"
+                    )
+                reward[i] = paid
                 after[i] = self._seen(observation)
             except Exception as error:
                 raise self._failure(i, error) from error
@@ -216,8 +221,10 @@ class HostPopulation(Population):
         return len(self.seeds)
 
     def restore(self, state: TrainingState) -> None:
-        each = range(len(self.seeds))
-        self._states = [jax.device_put(jax.tree.map(lambda x, i=i: x[i], state)) for i in each]
+        self._states = [
+            keyed(jax.device_put(jax.tree.map(lambda x, i=i: x[i], state)), old)
+            for i, old in enumerate(self._states)
+        ]
         self._leave_episodes()
 
     def advance(self, steps: int, *, strict: bool = True) -> Episodes:
@@ -397,7 +404,7 @@ def population_of(
 
 
 def _stack(members: Sequence[PyTree]) -> PyTree:
-    return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *members)
+    return jax.tree.map(lambda *x: np.stack([unkeyed(one) for one in x]), *members)
 
 
 def _stack_rows(rows: Sequence[np.ndarray]) -> Any:

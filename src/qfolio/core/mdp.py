@@ -209,7 +209,9 @@ class Task(eqx.Module):
     def rule(self, policy: Policy) -> Mapping[str, float | None]:
         """A few numbers that describe a policy (default: none).
 
-        A number is None if the policy does not have it, such as an edge that it never trades to.
+        Grades compare them with those of the exact policy, so that it is called only if the optimum
+        is a ``FollowedOptimum`` of ``qfolio.solvers.followed``. A number is None if the policy does
+        not have it, such as an edge that it never trades to.
         """
         return {}
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from qfolio.core import faults
-from qfolio.core.devices import Members, require_memory
+from qfolio.core.devices import Members, keyed, require_memory
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import CURVE_STARTS, STARTS, Greedy, evaluate, tail_steps
 from qfolio.core.mdp import Agent, Task
@@ -178,7 +178,7 @@ class Population:
     def task_fault(self, member: int = 0) -> str | None:
         """What is wrong with a member's task, if the fault is not in the learning."""
         task, agent = self._member(member)
-        return faults.find(task, agent, self.seeds[member])
+        return faults.find(task, agent, self.seeds[member], self.steps)
 
     def policy(self, member: int = 0) -> Callable[[PyTree], PyTree]:
         """A member's greedy policy as it is now: a function of one observation to its action.
@@ -232,7 +232,7 @@ class Population:
 
     def restore(self, state: TrainingState) -> None:
         """Restores the states that ``fetch`` returned."""
-        self.state = self._members.place(state)
+        self.state = keyed(self._members.place(state), self.state)
 
     def _fetch(self, where: Callable[[TrainingState], PyTree]) -> PyTree:
         """Parts of the members' states as numpy arrays, with a leading member axis."""

@@ -164,6 +164,11 @@ def find(kind: Kind, name: str) -> type[Any]:
     module, _, attribute = (where or name).partition(":")
     if not attribute or (where is None and not exists(module)):
         raise _unknown(kind, name)
+    if "<locals>" in attribute:
+        raise QfolioError(
+            f"the {kind} {name} is of a class within a function, which no name finds; define the "
+            f"class outside, or pass the {kind}, as in qfolio.Run.open(folder, {kind}=…)."
+        )
     found = getattr(import_own(module), attribute, None)
     home, _, above = ENTRIES[kind].base.partition(":")
     base = getattr(import_module(home), above)

@@ -128,6 +128,11 @@ def _rollout(
     task: Task, agent: Agent, state: TrainingState, *, learning: bool
 ) -> tuple[TrainingState, Episodes, Metrics]:
     """One rollout, then learning from it; the records have a leading time axis."""
+    return absorb(task, agent, *play(task, agent, state), learning=learning)
+
+
+def play(task: Task, agent: Agent, state: TrainingState) -> tuple[TrainingState, Transition]:
+    """The state after the steps of a rollout, from which nothing is learned yet, and these."""
 
     def step(carry: tuple[PyTree, Array], time: Array) -> tuple[tuple[PyTree, Array], tuple]:
         states, length = carry
@@ -158,9 +163,7 @@ def _rollout(
 
     times = state.steps + jnp.arange(agent.rollout_steps)
     (states, _), rollout = _scan(step, (state.task, state.tally.steps), times)
-    return absorb(
-        task, agent, eqx.tree_at(lambda s: s.task, state, states), rollout, learning=learning
-    )
+    return eqx.tree_at(lambda s: s.task, state, states), rollout
 
 
 def step_keys(key: UInt32[Array, "2"], time: Array) -> Key[Array, "4"]:

@@ -33,8 +33,9 @@ from qfolio.core.statistics import regret
 from qfolio.core.training import TrainingState
 from qfolio.experiments.budget import Budget, seed_range, unlearned
 from qfolio.experiments.comparison.ranking import middle_steps, steps_within
-from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.described import agent_of, describe, plain, task_of
 from qfolio.experiments.fit import Listener, Training, fit
+from qfolio.experiments.grading import optimal_returns
 from qfolio.experiments.log import JobLog, Log, seed_names
 from qfolio.experiments.records import Records
 from qfolio.learning.optimizer import Optimizer
@@ -211,7 +212,7 @@ class ContinualConfig(Config, frozen=True):
         after = {name: new for name, (_, new) in self.changes.items()}
         return Plan(
             task_of(self.task, self.task_settings),
-            task_of(self.task, self.task_settings | after),
+            task_of(self.task, plain(self.task_settings) | after),
             agent_of(self.agent, self.agent_settings),
             self.episodes,
             self.seeds,
@@ -347,9 +348,9 @@ class Grades:
     """
 
     def __init__(self, task: Task) -> None:
-        solution = task.optimum()
-        assert solution is not None
-        self.task, self._best = task, solution.returns(start_keys())
+        best = optimal_returns(task, start_keys())
+        assert best is not None
+        self.task, self._best = task, best
         counts = Population.starts, Population.curve_starts
         if not all(self._best[:starts].mean() for starts in counts):
             raise QfolioError(

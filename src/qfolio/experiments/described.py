@@ -1,6 +1,13 @@
 """Tasks and agents in configurations: by name and settings."""
 
+import dataclasses
+import hashlib
+import inspect
+from collections.abc import Mapping
 from typing import Any
+
+import jax
+import numpy as np
 
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError, require_type
@@ -8,21 +15,37 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.registry import Kind, build, name_of
 from qfolio.core.text import quote
 
+OTHERS = "other fields"
+"""The key of digests of the fields that are no settings; no field can have this name."""
+
 
 def describe(task: Task, agent: Agent) -> dict[str, Any]:
     """A task and an agent by name and settings, under the keys of configurations."""
     return {
         "task": name_of(task),
-        "task_settings": settings.describe(task),
+        "task_settings": recorded(task),
         "agent": name_of(agent),
-        "agent_settings": settings.describe(agent),
+        "agent_settings": recorded(agent),
     }
+
+
+def recorded(instance: Task | Agent) -> dict[str, Any]:
+    """The settings of a task or an agent, with digests of its other fields if it is given some."""
+    found = settings.describe(instance)
+    others = _others(instance)
+    return found | {OTHERS: others} if others else found
+
+
+def plain(described: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a task or an agent alone, without digests of its other fields."""
+    return {name: value for name, value in described.items() if name != OTHERS}
 
 
 def task_of(name: str, described: dict[str, Any], given: Task | None = None) -> Task:
     """The task of a configuration; imports no module that only the configuration names.
 
-    given: the task itself, if it cannot be restored. Raises QfolioError if it is another one.
+    given: the task itself, if it cannot be restored. Raises QfolioError if it is another one, or if
+    it is not given and the settings alone make another one.
     """
     task: Task = _part("task", Task, "a task, such as qfolio.Pendulum()", name, described, given)
     return task
@@ -37,16 +60,74 @@ def agent_of(name: str, described: dict[str, Any], given: Agent | None = None) -
 def _part(
     kind: Kind, base: type, wanted: str, name: str, described: dict[str, Any], given: Any
 ) -> Any:
+    values = plain(described)
     if given is None:
-        return build(kind, name, described)
-    require_type(kind, given, base, wanted)
-    for key, found, stored in (
-        (kind, name_of(given), name),
-        (f"{kind}_settings", settings.describe(given), described),
-    ):
-        if found != stored:
+        found = build(kind, name, values)
+        for field in _differing(found, described):
             raise QfolioError(
-                f"{key} is {quote(found)}, but what the folder holds was trained with "
+                f"{field} of the {kind} {name} is no setting, so no folder holds it, and it was "
+                f"not its default; give the {kind} where the folder is opened, as in "
+                f"qfolio.Run.open(folder, {kind}=…)."
+            )
+        return found
+    require_type(kind, given, base, wanted)
+    for key, now, stored in (
+        (kind, name_of(given), name),
+        (f"{kind}_settings", settings.describe(given), values),
+    ):
+        if now != stored:
+            raise QfolioError(
+                f"{key} is {quote(now)}, but what the folder holds was trained with "
                 f"{quote(stored)}; give that {kind}."
             )
+    for field in _differing(given, described):
+        raise QfolioError(
+            f"{field} of the {kind} is not what the folder was trained with; give that {kind}."
+        )
     return given
+
+
+def _differing(instance: Any, described: dict[str, Any]) -> list[str]:
+    """The fields that are no settings, and not as described; earlier folders describe none."""
+    now = _others(instance)
+    return [name for name, old in described.get(OTHERS, {}).items() if now.get(name) != old]
+
+
+def _others(instance: Any) -> dict[str, str]:
+    """Digests of the fields that are no settings, by name.
+
+    There are none if the class takes only settings: its other fields follow from these.
+    """
+    known = settings.names(type(instance))
+    if known.issuperset(inspect.signature(type(instance)).parameters):
+        return {}
+    others = [each.name for each in dataclasses.fields(instance) if each.name not in known]
+    return {name: _digest(repr(_content(getattr(instance, name))).encode()) for name in others}
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _content(value: Any) -> Any:
+    """Text, or tuples of it, which is the same for equal values, also in another process.
+
+    Of what is neither numbers nor text, such as a function, it says the name only.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        each = ((f.name, _content(getattr(value, f.name))) for f in dataclasses.fields(value))
+        return type(value).__qualname__, *each
+    if isinstance(value, Mapping):
+        return tuple(sorted((repr(key), _content(each)) for key, each in value.items()))
+    if isinstance(value, list | tuple):
+        return tuple(map(_content, value))
+    if isinstance(value, str | int | float | None):
+        return repr(value)
+    if isinstance(value, jax.Array) and jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key):
+        value = jax.random.key_data(value)
+    if hasattr(value, "__array__"):  # of numpy, jax, pandas, …
+        array = np.asarray(value)
+        if array.dtype == object:
+            return _content(array.tolist())
+        return array.dtype.str, array.shape, _digest(array.tobytes())
+    return getattr(value, "__qualname__", type(value).__qualname__)

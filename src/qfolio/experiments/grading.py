@@ -5,11 +5,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Key
 
 from qfolio.core import faults
-from qfolio.core.errors import QfolioError, require_whole
+from qfolio.core.errors import QfolioError, require_type, require_whole
 from qfolio.core.evaluation import greedy, start_keys
-from qfolio.core.mdp import Optimum
+from qfolio.core.mdp import Optimum, Task
 from qfolio.core.population import Population
 from qfolio.core.statistics import mean_interval, regret
 from qfolio.core.text import listed
@@ -38,8 +39,8 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
             population.task_fault()
             or f"The return of seed {bad} is not finite; check the step of {task.name}."
         )
-    solution = task.optimum()
-    optimum = None if solution is None else float(solution.returns(keys).mean())
+    best = optimal_returns(task, keys)
+    optimum = None if best is None else float(best.mean())
     regrets = regret(returns, optimum)
     interval = mean_interval(returns)
     return {
@@ -51,20 +52,38 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
         "overestimation_per_seed": [
             float(error) if np.isfinite(error) else None for error in played.overestimation
         ],
-        "rule": _rule(population, solution),
+        "rule": _rule(population),
     }
 
 
 def curve_optimum(population: Population) -> float | None:
     """The optimal mean return on the start states of the learning curve, if it is known."""
-    solution = population.task.optimum()
+    best = optimal_returns(population.task, start_keys())
+    return None if best is None else float(best[: population.curve_starts].mean())
+
+
+def optimal_returns(task: Task, keys: Key[Array, " start"]) -> np.ndarray | None:
+    """The best policy's returns, one for each key, if they are known.
+
+    Raises QfolioError unless the task's optimum gives them.
+    """
+    solution, place = task.optimum(), f"{type(task).__name__}.optimum()"
     if solution is None:
         return None
-    return float(solution.returns(start_keys())[: population.curve_starts].mean())
+    require_type(place, solution, Optimum, "None, or an object with a method returns")
+    found = np.asarray(solution.returns(keys))
+    wanted = f"it must give a finite number for each of the {len(keys):,} keys"
+    if found.shape != keys.shape or found.dtype.kind not in "fiu":
+        shape = ",".join(map(str, found.shape))
+        raise QfolioError(f"{place}.returns gives {found.dtype}[{shape}]; {wanted}.")
+    if not np.isfinite(found).all():
+        raise QfolioError(f"{place}.returns gives numbers that are not finite; {wanted}.")
+    return found
 
 
-def _rule(population: Population, solution: Optimum | None) -> dict[str, Any] | None:
+def _rule(population: Population) -> dict[str, Any] | None:
     """The members' policies and the best one as few numbers, in tasks that define them."""
+    solution = population.task.optimum()
     if not isinstance(solution, FollowedOptimum):
         return None
     task, agent, members = population.task, population.agent, population.weights()

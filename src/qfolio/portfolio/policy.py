@@ -341,9 +341,14 @@ class Policy:
         policy_folder.save(self, path_of("folder", folder))
 
     @classmethod
-    def open(cls, folder: Path | str) -> "Policy":
-        """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
-        return cls(**policy_folder.read(path_of("folder", folder)))
+    def open(cls, folder: Path | str, agent: Agent | None = None) -> "Policy":
+        """Reads what ``save`` wrote.
+
+        agent: the agent itself, if its settings alone do not make it.
+
+        Raises QfolioError if the folder holds no policy, or one of another agent.
+        """
+        return cls(**policy_folder.read(path_of("folder", folder), agent))
 
 
 def _slowed(agent: Agent) -> Agent:

@@ -19,7 +19,8 @@ from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import new_folder, read_tree, write_tree
 from qfolio.core.mdp import Agent
-from qfolio.core.registry import build, name_of
+from qfolio.core.registry import name_of
+from qfolio.experiments.described import agent_of, recorded
 from qfolio.portfolio.task import Portfolio
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def save(policy: "Policy", folder: Path) -> None:
     """Writes a policy into a new or empty folder."""
     config = PolicyConfig(
         agent=name_of(policy.agent),
-        settings=settings.describe(policy.agent),
+        settings=recorded(policy.agent),
         task=settings.describe(policy.task),
         assets=list(policy.assets),
         features=list(policy.features),
@@ -68,10 +69,12 @@ def save(policy: "Policy", folder: Path) -> None:
             write_tree(place / "learning.safetensors", policy.learner)
 
 
-def read(folder: Path) -> dict[str, Any]:
+def read(folder: Path, agent: Agent | None = None) -> dict[str, Any]:
     """The arguments of the ``Policy`` that was saved.
 
-    Raises QfolioError if the folder holds no policy.
+    agent: as for ``Policy.open``.
+
+    Raises QfolioError if the folder holds no policy, or one of another agent.
     """
     path = folder / "policy.json"
     config = read_config(path, PolicyConfig)
@@ -81,7 +84,7 @@ def read(folder: Path) -> dict[str, Any]:
         raise QfolioError(
             f"{path} is damaged: learned is {config.learned!r}, which is not a date."
         ) from None
-    agent: Agent = build("agent", config.agent, config.settings)
+    agent = agent_of(config.agent, config.settings, agent)
     task = _blank(config)
     state = state_template(task, agent, config.seeds)
     template = _kept(task, agent.weights(state))

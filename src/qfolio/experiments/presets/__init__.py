@@ -87,12 +87,14 @@ def changes(config: RunConfig, task: type[Task]) -> tuple[str, dict[str, tuple[A
     A run without a preset is compared with the first one; None if there is none.
     task: the class of the run's task.
     """
+    from qfolio.experiments.described import plain
+
     known = presets_of(config.task, config.agent)
     if not known:
         return None
     name = config.preset if config.preset in known else next(iter(known))
     own = known[name].described(task)
-    chosen = config.agent_settings | config.task_settings
+    chosen = plain(config.agent_settings | config.task_settings)
     return name, {
         key: (value, own.get(key)) for key, value in chosen.items() if value != own.get(key)
     }

@@ -33,6 +33,7 @@ from qfolio.experiments.budget import Budget, seed_range, unlearned
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Job, carry_out, persistent
 from qfolio.experiments.fit import Listener, Training
+from qfolio.experiments.grading import optimal_returns
 from qfolio.experiments.log import Log, add_result
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.records import Records
@@ -313,10 +314,10 @@ class Tuning:
         agents = {"best": self.configured(found.values), "preset": self.agent}
         with self._log() as log:
             returns = self.trained(agents, seeds, start_keys(), log, executor=executor)
-        solution = self.task.optimum()
 
         def optimum(keys: Key[Array, " start"]) -> float | None:
-            return None if solution is None else float(solution.returns(keys).mean())
+            best = optimal_returns(self.task, keys)
+            return None if best is None else float(best.mean())
 
         best, preset = finite(returns.tolist())
         summary = {

@@ -17,7 +17,6 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 import numpy as np
 
-from qfolio.core import settings
 from qfolio.core.config import (
     AgentName,
     Config,
@@ -42,6 +41,7 @@ from qfolio.core.mdp import Agent
 from qfolio.core.registry import BASELINES, name_of
 from qfolio.core.text import shell
 from qfolio.experiments.budget import Budget, seed_range
+from qfolio.experiments.described import recorded
 from qfolio.experiments.presets import Preset
 from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest.own import KINDS, Own
@@ -114,7 +114,7 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
             horizons = [each.task.get("horizon", 0) for each in (agent, chosen)]
             return AgentConfig(
                 agent=chosen.agent,
-                settings=settings.describe(chosen.build()),
+                settings=recorded(chosen.build()),
                 task=dict(chosen.task),
                 episodes=chosen.episodes,
                 shortened=horizons[0] if horizons[1] < horizons[0] else 0,
@@ -125,7 +125,7 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
             )
         return AgentConfig(
             agent=name_of(agent),
-            settings=settings.describe(agent),
+            settings=recorded(agent),
             task=dict(task),
             episodes=episodes,
         )

@@ -102,6 +102,11 @@ def _checked(signal: Signal, prices: Floats) -> Floats:
                 then, found[: row + 1], rtol=0, atol=_unit(then), equal_nan=True
             )
             if not np.all(same):
+                if not np.array_equal(signal(prices), found, equal_nan=True):
+                    raise QfolioError(
+                        f"The signal {name} has other values each time it is computed on the same "
+                        "table; draw its random numbers from a generator with a fixed seed."
+                    )
                 raise QfolioError(
                     f"The signal {name} looks ahead: its value at row {row} or earlier changes "
                     "when later rows are taken away."
