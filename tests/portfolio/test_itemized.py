@@ -1,5 +1,6 @@
 """Costs by kind, interest, fees and shorts, against a ledger in shares and money."""
 
+import dataclasses
 import math
 
 import jax
@@ -332,6 +333,12 @@ def test_debts_are_refused_where_weights_must_be_positive() -> None:
         simulate(np.ones((3, 1)), np.array([[1.5, -0.5]]), first=0, cost=0.0)
 
 
+@pytest.mark.parametrize("model", [Itemized(per_share=0.01), Itemized(impact=1.0)])
+def test_returns_have_no_share_prices(model: Itemized) -> None:
+    with pytest.raises(QfolioError, match="Returns give no share prices"):
+        Conditions.of(dataclasses.replace(table(1), levels=True), model)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -345,6 +352,7 @@ def test_debts_are_refused_where_weights_must_be_positive() -> None:
         ("itemized(cash_rate=5)", "from -1 to 1"),
         ("itemized(spread=column:nothing)", "does not have"),
         ("itemized(cash_rate=column:fee)", "one rate for each date"),
+        ("itemized(maximum=0.5)", "from 0 to 0.2, or 1"),
     ],
 )
 def test_settings_that_do_not_fit(text: str, said: str) -> None:

@@ -79,6 +79,11 @@ class Conditions(NamedTuple):
 def _column(name: str, prices: Prices) -> Floats:
     """A column's values, of shape (row, asset) or (row, 1); 0 before an asset's first price."""
     if name == "price":
+        if prices.levels:
+            raise QfolioError(
+                "Returns give no share prices, on which per_share and impact depend; leave these "
+                "out of the cost model, or give a table of prices."
+            )
         return np.nan_to_num(prices.values)
     if name in prices.feature_names:
         return np.nan_to_num(prices.features[..., prices.feature_names.index(name)])

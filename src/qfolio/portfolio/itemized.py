@@ -86,7 +86,7 @@ class Itemized(CostModel):
         require(self, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
         amounts = "fixed per_share minimum impact"
         require(self, amounts, lambda x: 0 <= x < math.inf, "at least 0")
-        require(self, "maximum", lambda x: 0 <= x <= 1, "from 0 to 1")
+        require(self, "maximum", lambda x: 0 <= x <= 0.2 or x == 1, "from 0 to 0.2, or 1")
         require(self, "impact_power", lambda x: 0 < x <= 2, "above 0 and at most 2")
         require(self, "capital", lambda x: 0 < x < math.inf, "above 0")
         require(self, "borrow_spread", lambda x: 0 <= x <= 1, "from 0 to 1 per year")
@@ -120,7 +120,8 @@ class Itemized(CostModel):
         """The remainder factor mu solves mu = 1 − Σᵢ kᵢ(mu·bᵢ − wᵢ), with the costs kᵢ of a trade.
 
         The sum is convex in mu, so that Newton's method descends to the root from mu = 1, and its
-        last step has the derivatives of the root.
+        last step has the derivatives of the root. A ``maximum`` adds a kink that is not convex, and
+        too small to keep the method from the root.
         """
         xp = before.__array_namespace__()
         held, wanted = before[..., 1:], after[..., 1:]

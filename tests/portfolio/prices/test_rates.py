@@ -21,7 +21,7 @@ def rates(table: pd.DataFrame) -> list[str]:
 @pytest.mark.parametrize(
     "name",
     ["rate", "Cash_Rate", "10y yield", "IRX", "^IRX", "TNX", "VIX", "VIX Index", "T-Bill",
-     "risk_free", "riskfree"],
+     "risk_free", "riskfree", "T-Bills", "FEDFUNDS"],
 )  # fmt: skip
 def test_names_of_rates(name: str):
     (warning,) = findings(market(**{name: random_walk(ROWS, 1, 7)[:, 0]}))
@@ -31,7 +31,17 @@ def test_names_of_rates(name: str):
 
 
 @pytest.mark.parametrize(
-    "name", ["Corporate", "Pirates", "Vixen", "US High Yield", "Floating Rate Notes", "RF", "CASHX"]
+    "name",
+    [
+        "Corporate",
+        "Pirates",
+        "Vixen",
+        "US High Yield",
+        "Floating Rate Notes",
+        "RF",
+        "CASHX",
+        "High Dividend Yield",
+    ],
 )
 def test_names_of_assets(name: str):
     assert findings(market(**{name: random_walk(ROWS, 1, 7)[:, 0]})) == []

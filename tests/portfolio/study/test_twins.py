@@ -44,6 +44,13 @@ def test_tables_that_are_no_twins():
     later = price_table(VALUES, "ABCD", weekdays(ROWS, "2030-01-01"))
     flat = price_table(np.full_like(VALUES, 5.0), "ABCD")
     assert twins({"one": TABLE, "others": others, "later": later, "flat": flat}) == []
+    # One asset that both have, and that moves more than the others.
+    wild = random_walk(ROWS, 1, 3, volatility=0.3)
+    alike = [
+        price_table(np.hstack([wild, random_walk(ROWS, 2, seed, volatility=0.005)]), "ABC")
+        for seed in (4, 5)
+    ]
+    assert twins({"one": alike[0], "two": alike[1]}) == []
     # Two halves of one table that overlap little.
     first, second = TABLE.between(0, 240), TABLE.between(180, 400)
     assert twins({"first": first, "second": second}) == []

@@ -10,13 +10,13 @@ ADJUSTED_NAMES = ("adjusted close", "adj close", "adjclose", "adjusted price", "
 PRICE_NAMES = ("close", "price", "value")
 RETURN_NAMES = ("return", "returns", "ret", "net return", "net returns", "daily return")
 RATE_NAMES = (
-    "rate", "rates", "yield", "yields", "riskfree", "risk free", "tbill", "t bill", "irx", "fvx",
-    "tnx", "tyx", "vix", "euribor", "libor",
+    "rate", "rates", "yield", "yields", "riskfree", "risk free", "tbill", "tbills", "t bill",
+    "t bills", "irx", "fvx", "tnx", "tyx", "vix", "euribor", "libor", "sofr", "fedfunds",
 )  # fmt: skip
 """Words in the names of rates, yields and volatility indices, which are no prices."""
 PRICED_NAMES = (
-    "high yield", "floating rate", "fixed rate", "bond", "bonds", "etf", "fund", "futures", "note",
-    "notes", "reit", "short", "trust",
+    "high yield", "dividend", "income", "equity", "floating rate", "fixed rate", "bond", "bonds",
+    "etf", "fund", "futures", "note", "notes", "reit", "short", "trust",
 )  # fmt: skip
 """Words in the names of assets that are named after such a rate."""
 SETTINGS = (

@@ -29,7 +29,7 @@ def twins(tables: Mapping[str, Prices]) -> list[str]:
 
 
 def _correlation(one: Prices, other: Prices) -> tuple[float, int]:
-    """The correlation of all returns between common dates, and their number.
+    """The usual asset's correlation of returns between common dates, and the number of dates.
 
     It is 0 for tables that differ in their assets, or that have few dates in common.
     """
@@ -39,9 +39,10 @@ def _correlation(one: Prices, other: Prices) -> tuple[float, int]:
     if len(mine) < SHARED * min(len(one), len(other)):
         return 0.0, len(mine)
     values = one.known[mine], other.select(one.assets).known[its]
-    moves = [np.diff(np.log(each), axis=0).ravel() for each in values]
-    known = np.isfinite(moves[0]) & np.isfinite(moves[1])
-    first, second = (each[known] for each in moves)
-    if len(first) < FEWEST or not (first.std() and second.std()):
-        return 0.0, len(mine)
-    return float(np.corrcoef(first, second)[0, 1]), len(mine)
+    found = []
+    for first, second in zip(*(np.diff(np.log(each), axis=0).T for each in values), strict=True):
+        known = np.isfinite(first) & np.isfinite(second)
+        first, second = first[known], second[known]
+        if len(first) >= FEWEST and first.std() and second.std():
+            found.append(np.corrcoef(first, second)[0, 1])
+    return float(np.median(found)) if found else 0.0, len(mine)
