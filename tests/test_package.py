@@ -80,6 +80,9 @@ WRONG_TYPES = {
     "Pendulum(mass=None)": "mass is null; it must be a number.",
     "Portfolio.of(prices, anchor=3)": "anchor is 3; it must be text.",
     "preset('fast', Pendulum())": "task is Pendulum(); it must be text.",
+    "read_holdings(None, ['A'], '100')": "capital is '100'; it must be a sum of money, such as",
+    "read_holdings(None, ['A'], True)": "capital is True; it must be a sum of money, such as",
+    "require_fresh(prices, 7)": "--as-of is '7'; it must be a date such as 2025-12-31.",
 }
 
 
@@ -90,7 +93,10 @@ def said(tmp_path_factory):
     write_table(folder / "prices.csv")
     script = f"""if True:
         import json, qfolio
+        from qfolio.portfolio.desk.allocation import require_fresh
+        from qfolio.portfolio.desk.holdings import read_holdings
         names = {{name: getattr(qfolio, name) for name in dir(qfolio)}}
+        names |= {{"read_holdings": read_holdings, "require_fresh": require_fresh}}
         names["prices"] = qfolio.load_prices("prices.csv")
         names["tilts"] = qfolio.preset("fast", "portfolio", "tilts")
         names["agents"] = {{"tilts": names["tilts"]}}

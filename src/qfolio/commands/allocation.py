@@ -74,17 +74,16 @@ def allocate(
         returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
             shares and orders need prices (default: they are prices).
     """
-    inputs = {"--prices": prices, "--holdings": holdings, "--members": latest.members}
-    for option, file in inputs.items():
-        if orders is not None and file is not None and file.resolve() == orders.resolve():
-            raise QfolioError(f"{option} and --orders name one file; give orders their own.")
     prepare(trust)
     from qfolio.commands import console
     from qfolio.commands.console.desk import print_allocation
     from qfolio.commands.console.tables import print_warnings
     from qfolio.core.text import listed
     from qfolio.portfolio.desk.desk import Desk
+    from qfolio.portfolio.desk.orders_csv import require_apart
 
+    if orders is not None:
+        require_apart(orders, "--members", latest.members)
     latest.require_table(prices, returns)
     desk = Desk.open(folder, returns=returns, **latest.reading)
     if reproduce is not None:

@@ -43,6 +43,13 @@ def test_names_and_money_that_are_given_otherwise(tmp_path: Path):
         read_holdings(None, ASSETS, float("nan"))
 
 
+@pytest.mark.parametrize("text", [None, "asset,shares\nNA,2\n"])
+def test_capital_becomes_a_float(tmp_path: Path, text: str | None):
+    path = None if text is None else write(tmp_path, text)
+    _, cash = read_holdings(path, ASSETS, 10_000)
+    assert (type(cash), cash) == (float, 10_000)
+
+
 def test_shorts_and_loans_where_they_are_allowed(tmp_path: Path):
     path = write(tmp_path, "asset,shares\nAAA,-1.5\nBBB,4\ncash,-7\n")
     shares, cash = read_holdings(path, ASSETS, None, debts=True)

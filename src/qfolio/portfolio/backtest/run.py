@@ -386,14 +386,18 @@ class Backtest:
             kept["learned"].astype("datetime64[s]")[()],
         )
 
-    def keep(self, agent: str | None, policy: Policy) -> None:
+    def keep(self, agent: str | None, policy: Policy) -> str:
         """Stores an updated policy as the agent's policy for tomorrow; earlier ones are kept.
+
+        Returns its name among those of the agent.
 
         Raises QfolioError if that of the whole table is not trained yet, whose name it may have.
         """
         self._kept.require(self._name(agent), self._plan.current)
         kept = learning(policy.learner, policy.updates, policy.learned)
-        self._kept.write_policy(self._name(agent), tomorrow(policy.updates), kept)
+        stored = tomorrow(policy.updates)
+        self._kept.write_policy(self._name(agent), stored, kept)
+        return stored
 
     def newest(self, agent: str) -> str:
         """The name of the agent's newest policy for tomorrow, see ``kept.tomorrow``."""

@@ -331,10 +331,11 @@ def settled(
     return cash, {kind: wealth * float(share) for kind, share in costs.items()}
 
 
-def require_fresh(prices: Prices, as_of: str | None) -> None:
+def require_fresh(prices: Prices, as_of: str | datetime.date | None) -> None:
     """Raises QfolioError unless prices end shortly before ``as_of`` (default: today)."""
+    given = datetime.date.today() if as_of is None else as_of
     try:
-        today = datetime.date.today() if as_of is None else datetime.date.fromisoformat(as_of)
+        today = datetime.date.fromisoformat(str(given))
     except ValueError:
         raise QfolioError(
             f"--as-of is {quote(as_of)}; it must be a date such as 2025-12-31."

@@ -1,7 +1,7 @@
 """From a run to orders: allocations that the run's ledger records and can reproduce."""
 
 import datetime
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -12,6 +12,7 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import path_of
+from qfolio.core.mdp import Agent
 from qfolio.core.registry import again
 from qfolio.core.text import amount, near, quote
 from qfolio.core.version import __version__
@@ -25,7 +26,7 @@ from qfolio.portfolio.desk.drivers import reasons, sentence
 from qfolio.portfolio.desk.history import revisions
 from qfolio.portfolio.desk.holdings import cashed_out, read_holdings
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
-from qfolio.portfolio.desk.orders_csv import order_rows, replaced
+from qfolio.portfolio.desk.orders_csv import order_rows, require_apart, written
 from qfolio.portfolio.desk.standing import Kind, Standing
 from qfolio.portfolio.desk.untrained import Ordered, Rule, Untrained
 from qfolio.portfolio.mandate.limits import lots
@@ -58,9 +59,15 @@ class Desk:
     delists: bool = False
 
     @staticmethod
-    def open(folder: Path | str, **options: Any) -> "Desk":
-        """The desk of a finished backtest; options are those of ``prices.load``."""
-        run = Backtest.open(folder)
+    def open(
+        folder: Path | str, agents: Mapping[str, Agent] | None = None, **options: Any
+    ) -> "Desk":
+        """The desk of a finished backtest.
+
+        agents: by name, those that the folder cannot restore, as for ``Backtest.open``. options:
+        those of ``prices.load``.
+        """
+        run = Backtest.open(folder, agents)
         known = {**options, "features": options.get("features") or tuple(run.config.feature_names)}
         known["columns"] = options.get("columns") or tuple(run.config.prices.get("columns", ()))
         ends = "gap" if run.prices.listed is None else "cash-out"
@@ -202,7 +209,7 @@ class Desk:
         *,
         anyway: bool = False,
         whole_shares: bool = False,
-        as_of: str | None = None,
+        as_of: str | datetime.date | None = None,
         update: bool = False,
         orders: Path | str | None = None,
         layout: str = "generic",
@@ -222,6 +229,11 @@ class Desk:
             QfolioError: The backtest advises against the agent, an input does not fit, or the
                 policy has learned from later prices.
         """
+        source = None if holdings is None else path_of("holdings", holdings)
+        place = None if orders is None else path_of("orders", orders)
+        if place is not None:
+            require_apart(place, "--prices", prices)
+            require_apart(place, "--holdings", source)
         name = next(iter(self.run.agents)) if agent is None else agent
         standing = Standing.of(self.folder, name, self.kind(name))
         if not anyway:
@@ -232,7 +244,6 @@ class Desk:
             in_shares = whole_shares or holdings is not None or orders is not None
             _require_weights_alone(followed, in_shares)
         require_fresh(table, as_of)
-        source = None if holdings is None else path_of("holdings", holdings)
         held = read_holdings(source, table.assets, capital, debts=self.debts)
         shares, cash, said = cashed_out(*held, table)
         updated = None
@@ -256,8 +267,8 @@ class Desk:
             debts=self.debts,
         )
         wanted = None
-        if orders is not None:
-            wanted = path_of("orders", orders), *order_rows(allocation, layout, currency)
+        if place is not None:
+            wanted = place, *order_rows(allocation, layout, currency)
         trained, why = None, None
         if isinstance(followed, Policy):
             trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
@@ -268,7 +279,7 @@ class Desk:
         said += self.terms(followed, table, allocation, spent)
         record, done = None, "A dry run: nothing is written."
         if not dry_run:
-            with nullcontext() if wanted is None else replaced(*wanted):
+            with nullcontext() if wanted is None else written(*wanted):
                 if hindsight:
                     done = f"{hindsight}, so that nothing is recorded."
                 else:
@@ -349,8 +360,8 @@ class Desk:
         Returns the record, and a sentence that says what was done.
         """
         held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
-        with nullcontext() if updated is None else self._keeping(name, updated):
-            stored = self.run.newest(name) if name in self.run.agents else None
+        newest = self.run.newest(name) if name in self.run.agents else None
+        with nullcontext(newest) if updated is None else self._keeping(name, updated) as stored:
             digests = {"prices": prices.sha256, "holdings": held, **self._digests(name, stored)}
             return self.ledger.append(
                 allocation,
@@ -365,17 +376,16 @@ class Desk:
             )
 
     @contextmanager
-    def _keeping(self, name: str, updated: Policy) -> Iterator[None]:
-        """Stores an updated policy for a block; it goes if the block fails.
+    def _keeping(self, name: str, updated: Policy) -> Iterator[str]:
+        """Stores an updated policy for a block, which gets its name; it goes if the block fails.
 
         Otherwise the next try would find that the policy has already learned from the new rows.
         """
-        self.run.keep(name, updated)
+        stored = self.run.keep(name, updated)
         try:
-            yield
+            yield stored
         except BaseException:
-            stored = BacktestFolder(self.folder).policy_file(name, self.run.newest(name))
-            stored.unlink(missing_ok=True)
+            BacktestFolder(self.folder).policy_file(name, stored).unlink(missing_ok=True)
             raise
 
     def reproduce(

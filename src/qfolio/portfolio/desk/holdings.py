@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.desk.orders_csv import spelled
 from qfolio.portfolio.prices.cells import CURRENCIES, is_missing, label, not_a_number, numbers
@@ -36,11 +37,14 @@ def read_holdings(
             asset twice, a number cannot be read or is negative without debts, or cash is given
             twice.
     """
-    if capital is not None and not 0 <= capital < math.inf:
-        raise QfolioError(f"--capital is {capital}; it must be a sum of money, at least 0.")
+    if capital is not None:
+        require_type("capital", capital, Real, "a sum of money, such as 10000")
+        if not 0 <= capital < math.inf:
+            raise QfolioError(f"--capital is {capital}; it must be a sum of money, at least 0.")
+    money = float(capital or 0)
     shares = np.zeros(len(assets))
     if path is None:
-        return shares, capital or 0.0
+        return shares, money
     table = read(path, _name_columns)
     name_column = _only_column(path, table.names, ASSET_NAMES)
     shares_column = _only_column(path, table.names, SHARES_NAMES)
@@ -72,7 +76,7 @@ def read_holdings(
         held[name] = amount
     if not held:  # an export may have been cut short
         raise QfolioError(f"{path} lists no holdings; leave it out if all is cash.")
-    cash = held.pop(CASH, capital or 0.0)
+    cash = held.pop(CASH, money)
     for name, amount in held.items():
         shares[places[name]] = amount
     return shares, cash

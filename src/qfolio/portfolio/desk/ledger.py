@@ -230,8 +230,8 @@ class Ledger:
 
 
 def holdings_digest(assets: Sequence[str], shares: np.ndarray, cash: float) -> str:
-    """SHA-256 of shares by asset, and cash."""
-    return digest([list(assets), shares.tolist(), cash])
+    """SHA-256 of shares by asset, and cash, in the floats that a record holds."""
+    return digest([list(assets), shares.astype(float).tolist(), float(cash)])
 
 
 def digest(content: Any) -> str:

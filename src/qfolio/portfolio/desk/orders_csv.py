@@ -1,16 +1,17 @@
 """Orders as CSV, in columns that brokers read."""
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import UNFINISHED, naming, write_csv
+from qfolio.core.files import write_bytes, write_csv
 from qfolio.core.text import near, quote
 from qfolio.portfolio.desk.allocation import Allocation
 
@@ -37,26 +38,26 @@ def order_rows(allocation: Allocation, layout: str, currency: str) -> tuple[list
 
 
 @contextmanager
-def replaced(path: Path, header: list[str], rows: Rows) -> Iterator[None]:
-    """Writes orders beside ``path`` before a block, which records them, and renames them after it.
+def written(path: Path, header: list[str], rows: Rows) -> Iterator[None]:
+    """Writes orders before a block, which records them: nothing is recorded that is not written.
 
-    So nothing is recorded that cannot be written, and if the block fails, an earlier file stays.
-
-    Raises QfolioError if the path is a folder.
+    If the block fails, an earlier file is restored, or a new one removed.
     """
-    if path.is_dir():
-        raise QfolioError(f"{path} is a folder; name a file.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}{UNFINISHED}")
+    earlier = path.read_bytes() if path.is_file() else None
+    write_csv(path, header, rows)
     try:
-        with naming(path):
-            write_csv(temporary, header, rows)
         yield
-        with naming(path):
-            temporary.replace(path)
-    finally:
-        with suppress(OSError):  # on a disk that has become read-only
-            temporary.unlink(missing_ok=True)
+    except BaseException:
+        path.unlink(missing_ok=True)  # first: a full disk may need its room
+        if earlier is not None:
+            write_bytes(path, earlier)
+        raise
+
+
+def require_apart(orders: Path, option: str, source: Any) -> None:
+    """Raises QfolioError if orders would replace the file of an option, which is read."""
+    if isinstance(source, str | os.PathLike) and Path(source).resolve() == orders.resolve():
+        raise QfolioError(f"{option} and --orders name one file; give orders their own.")
 
 
 def _generic(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
