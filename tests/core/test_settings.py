@@ -4,6 +4,7 @@ import math
 import re
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -124,12 +125,24 @@ def test_counts_shape_the_program():
         (str, "a", r"is text, which shapes the program; declare it as part: str = static\(…\)"),
         (bool, True, r"is true or false, which .*; declare it as part: bool = static\(…\)"),
         (Any, "a", r"is of type str, which .*; declare it as part: .*Any = static\(…\)"),
-        (dict, {"sign": abs}, r"is of type builtin_function_or_method, which shapes the program"),
+        (dict, {"sign": abs}, r"holds a function, which .*; declare it as part: dict = static"),
     ],
 )
 def test_what_is_no_number_shapes_the_program(kind, value, says):
     with pytest.raises(QfolioError, match=f"^part of Own {says}"):
         type("Own", (OneState,), {"__annotations__": {"part": kind}, "part": part(value)})()
+
+
+def test_a_network_is_held_by_its_arrays():
+    """As a static field its arrays would be constants, of which jax warns."""
+    network = eqx.nn.MLP(2, 1, 4, 1, key=jax.random.key(0))
+    own = type("Own", (OneState,), {"__annotations__": {"part": Any}, "part": part(network)})
+    with pytest.raises(
+        QfolioError, match=r"^part of Own holds a function, .*; keep its arrays, as"
+    ):
+        own()
+    arrays, _ = eqx.partition(network, eqx.is_array)
+    assert jax.tree.leaves(own(part=arrays).part)
 
 
 def part(value):

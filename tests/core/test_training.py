@@ -1,3 +1,4 @@
+import itertools
 import os
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import pytest
 from qfolio.agents.a2c import A2C
 from qfolio.agents.dqn import DQN
 from qfolio.agents.ppo import PPO
+from qfolio.core import faults
 from qfolio.core.contract import learning_of
 from qfolio.core.devices import Members, configure
 from qfolio.core.errors import QfolioError
@@ -315,6 +317,45 @@ def test_a_fault_is_sought_in_the_task_of_the_member_that_failed():
     population.advance(1000)  # warm-up
     with pytest.raises(QfolioError, match="With seed 5, the reward of Overflowing is not finite"):
         population.advance(1000)
+
+
+def test_a_fault_is_sought_with_one_state_in_memory(task, agent, monkeypatch):
+    """A large replay buffer may not fit in memory twice."""
+    given, compiled = [], jax.jit
+
+    def jit(function, **options):
+        program = compiled(function, **options)
+
+        def call(*args, **changes):
+            if function.__name__ == "train":
+                given.append(args[1])
+            return program(*args, **changes)
+
+        return call
+
+    with monkeypatch.context() as patched:
+        patched.setattr(faults.jax, "jit", jit)
+        assert faults.find(task, agent, 0, 1000) is None
+    assert len(given) > 1
+    assert all(leaf.is_deleted() for state in given for leaf in jax.tree.leaves(state))
+
+
+def test_no_fault_is_found_where_memory_is_too_small(task, agent, monkeypatch):
+    """The error that led to the search is told."""
+
+    def exhausted(*args):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    monkeypatch.setattr(faults, "begin", exhausted)
+    assert faults.find(task, agent, 0) is None
+
+
+def test_a_fault_is_not_sought_for_long(task, agent, monkeypatch):
+    """Before the error of a learning that failed late, nothing is said."""
+    seconds = itertools.count(0, 2)
+    monkeypatch.setattr(faults, "perf_counter", lambda: next(seconds))
+    assert faults.find(task, agent, 0, 100_000) is None
+    assert next(seconds) <= 14
 
 
 def test_hyperparameters_can_differ_between_members(task, agent):

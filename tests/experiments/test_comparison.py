@@ -483,6 +483,31 @@ def test_agents_that_do_not_fit_are_refused_before_anything_is_trained(tmp_path)
     assert not (tmp_path / "run").exists()
 
 
+class Leaning(DQN):
+    """Holds what is no setting."""
+
+    towards: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2))
+
+
+def test_what_settings_do_not_describe_is_refused_before_a_folder_is_made(tmp_path):
+    """It was made, and could not be opened."""
+
+    class Local(DQN):
+        pass
+
+    for agent, says in (
+        (Leaning(**TINY, towards=np.ones(2)), r"but towards of the agent .*:Leaning is no setting"),
+        (Local(**TINY), "these do not make the agent .*:.*Local; define its class outside"),
+    ):
+        entrants = tiny()
+        entrants["odd"] = dataclasses.replace(entrants["slow"], agent=agent)
+        with pytest.raises(QfolioError, match=rf"^A comparison takes only what a name .*{says}"):
+            Comparison.create(entrants, seeds=3, out=tmp_path / "run")
+        assert not any(tmp_path.iterdir())
+    entrants["odd"] = dataclasses.replace(entrants["slow"], agent=Leaning(**TINY))
+    Comparison.create(entrants, seeds=3, out=tmp_path / "run")
+
+
 @pytest.mark.parametrize(
     ("names", "says"),
     [(["Q fast", "q"], "An agent is called 'Q fast'; use letters"),

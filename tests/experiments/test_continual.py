@@ -203,6 +203,16 @@ def test_an_agent_without_a_schedule_cannot_go_on():
         Plan(OLD, NEW, QLearning(), EPISODES)
 
 
+def test_what_settings_do_not_describe_is_refused_before_a_folder_is_made(tmp_path):
+    class Local(DQN):
+        pass
+
+    plan = dataclasses.replace(PLAN, agent=Local(learning_rate_final=0.0))
+    with pytest.raises(QfolioError, match=r"^Continual learning takes only what .*:.*Local"):
+        create(plan, tmp_path / "run")
+    assert not any(tmp_path.iterdir())
+
+
 def test_there_is_no_share_of_an_optimum_of_zero():
     with pytest.raises(QfolioError, match=r"that of Kelly\(.*probability=0\.4.*\) is 0; choose"):
         Grades(Kelly(probability=0.4))

@@ -1,4 +1,5 @@
 import contextlib
+import copy
 import dataclasses
 import json
 import os
@@ -7,11 +8,16 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import date
+from enum import Enum
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from safetensors.numpy import load_file
 
@@ -26,7 +32,7 @@ from qfolio.core.files import write_arrays
 from qfolio.core.mdp import Discrete, Step, Task
 from qfolio.core.text import four_digits
 from qfolio.experiments.budget import Budget
-from qfolio.experiments.described import OTHERS, recorded
+from qfolio.experiments.described import OTHERS, agent_of, recorded
 from qfolio.experiments.grading import curve_optimum
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.ar1 import Ar1
@@ -88,6 +94,10 @@ def test_a_run_is_opened_with_what_it_was_trained_with(task, agent, tmp_path):
         Run.open(tmp_path / "run", agent=other)
     with pytest.raises(QfolioError, match=r"task is .market/ar1., but .* was trained with"):
         Run.open(tmp_path / "run", task=Ar1())
+
+
+class Unit(Enum):
+    DAY, MONTH = "day", "month"
 
 
 class Bandit(OneState):
@@ -157,6 +167,65 @@ def test_a_folder_that_says_nothing_of_an_array_is_opened(tmp_path):
     assert config["task_settings"].pop(OTHERS).keys() == {"pay"}
     file.write_text(json.dumps(config))
     assert Run.open(tmp_path / "run", task=task).task is task
+
+
+class Holding(OneState):
+    """Holds anything, which shapes the program."""
+
+    held: Any = eqx.field(static=True, default=None)
+
+
+@dataclasses.dataclass
+class Box:
+    """Holds arrays, too, without a warning of jax."""
+
+    content: Any
+
+
+def digest(content):
+    return recorded(Holding(held=Box(content)))[OTHERS]["held"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (np.float32, np.float64),
+        (b"a", b"b"),
+        ({1, 2}, {1, 3}),
+        (range(3), range(4)),
+        (1 + 2j, 1 + 3j),
+        (date(2020, 1, 1), date(2020, 1, 2)),
+        (np.datetime64(5, "s"), np.datetime64(5, "m")),
+        (Unit.DAY, Unit.MONTH),
+        (partial(max, 1), partial(max, 2)),
+        (partial(max, key=abs), partial(max, key=len)),
+        (pd.DataFrame({"a": [1.0]}), pd.DataFrame({"b": [1.0]})),
+        (pd.DataFrame({"a": ["x"]}), pd.DataFrame({"b": ["x"]})),
+        (pd.Series([1.0], ["a"]), pd.Series([1.0], ["b"])),
+    ],
+)
+def test_fields_with_another_content_have_another_digest(first, second):
+    assert digest(first) == digest(copy.deepcopy(first))
+    assert digest(first) != digest(second)
+
+
+def test_equal_fields_have_the_same_digest():
+    assert digest(np.float64(0.5)) == digest(0.5)
+    assert digest(np.int32(3)) == digest(3)
+    assert digest({"a": 1, "b": {2, 3}}) == digest({"b": {3, 2}, "a": 1})
+    assert digest({"b", "a", 1, None}) == digest({None, 1, "a", "b"})
+    assert digest(np.array(np.float32, object)) == digest(np.array(np.float32, object))
+
+
+def test_where_an_agent_itself_is_given_is_said():
+    """A backtest takes several."""
+    described = recorded(Towards(held=np.ones(2)))
+    with pytest.raises(QfolioError, match=r"opened, as agent=…, or in agents=\{…\} of a backtest"):
+        agent_of(f"{__name__}:Towards", described)
+
+
+class Towards(DQN):
+    held: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2))
 
 
 def test_tables_that_follow_from_settings_are_not_recorded():

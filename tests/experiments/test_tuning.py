@@ -352,6 +352,20 @@ def test_a_budget_in_which_nothing_is_learned_is_refused(tmp_path, task, agent):
     start(tmp_path / "s", task, agent, "learning_starts=100|102")
 
 
+class Weighted(DQN):
+    """Holds what is no setting."""
+
+    weights_of: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2))
+
+
+def test_what_settings_do_not_describe_is_refused_before_a_folder_is_made(tmp_path, task, agent):
+    """It was made, and could not be opened."""
+    odd = Weighted(**settings.describe(agent), weights_of=np.ones(2))
+    with pytest.raises(QfolioError, match=r"^A search takes only what .*, but weights_of of "):
+        start(tmp_path / "s", task, odd)
+    assert not any(tmp_path.iterdir())
+
+
 def test_numbers_that_do_not_fit_the_task(tmp_path):
     agent, says = (
         SAC(hidden=(4,), learning_starts=8, batch_size=8),

@@ -124,11 +124,16 @@ def sentence_on(error: BaseException) -> str | None:
     """What to tell of an error of a user's own code, or of too little memory; None of another."""
     if isinstance(error, WorkerError):
         return error.sentence
-    exhausted = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)  # jax's own
-    if isinstance(error, MemoryError) or exhausted:
+    if is_out_of_memory(error):
         return OUT_OF_MEMORY
     own = own_frame(error)
     return None if own is None else f"{own.name} failed: {one_line(error)}."
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether there was too little memory, of the machine or of a device."""
+    exhausted = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)  # jax's own
+    return isinstance(error, MemoryError) or exhausted
 
 
 def told(error: BaseException) -> str | None:

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, is_out_of_memory
 from qfolio.core.mdp import Agent, Discrete, Simplex, Task, Transition
 from qfolio.core.registry import own_modules
 from qfolio.core.training import (
@@ -24,7 +24,7 @@ from qfolio.core.training import (
     play,
 )
 
-SECONDS = 30.0
+SECONDS = 10.0
 """Most time in which a fault is sought, except for compiling."""
 
 OFF = 1e-3
@@ -46,8 +46,19 @@ def find(task: Task, agent: Agent, seed: int, steps: int = 0) -> str | None:
 
     Observations of a task with ``states`` have to be numbers of states. Trains again from the
     beginning until then, or until learning fails first. It takes at most ``SECONDS`` and as many
-    ``steps`` as the training took, but at least an episode's.
+    ``steps`` as the training took, but at least an episode's. Where memory is too small for a
+    second training, none is found.
     """
+    try:
+        return _find(task, agent, seed, steps)
+    except Exception as error:
+        if is_out_of_memory(error):
+            return None
+        raise
+
+
+def _find(task: Task, agent: Agent, seed: int, steps: int) -> str | None:
+    """``find``, which may run out of memory."""
     arrays, rest = eqx.partition((task, agent), eqx.is_array)
 
     def both(arrays: PyTree) -> tuple[Task, Agent]:
@@ -56,7 +67,7 @@ def find(task: Task, agent: Agent, seed: int, steps: int = 0) -> str | None:
 
     state = jax.jit(lambda arrays: begin(*both(arrays), jnp.uint32(seed)))(arrays)
 
-    @partial(jax.jit, static_argnames="learning")
+    @partial(jax.jit, static_argnames="learning", donate_argnames="state")
     def train(
         arrays: PyTree, state: TrainingState, most: Array, *, learning: bool
     ) -> tuple[TrainingState, Checked]:

@@ -14,8 +14,8 @@ from qfolio.core.settings import SCALARS, converted
 
 T = TypeVar("T")
 
-FIXED = {"int": "a whole number", "bool": "true or false", "str": "text"}
-"""Types of settings that shape the program, by name, and what these are called."""
+FIXED = {"int": "is a whole number", "bool": "is true or false", "str": "is text"}
+"""Types of settings that shape the program, by name, and what is said of these."""
 
 
 def static(default: Any) -> Any:
@@ -102,19 +102,21 @@ def require_static(instance: Any) -> None:
     """Raises QfolioError if a setting is not ``static`` but has to be, or a default is undeclared.
 
     Integers are counts, and counts shape the compiled program, as do words and choices; it takes
-    only numbers and arrays. A subclass that gives an inherited setting a value without its type
-    would change nothing.
+    only numbers and arrays, not functions beside these, as in a network. A subclass that gives an
+    inherited setting a value without its type would change nothing.
     """
     name = type(instance).__name__
     for field in dataclasses.fields(instance):
         fixed, kind = field.metadata.get("static"), str(getattr(field.type, "__name__", field.type))
         leaves = [] if fixed else jax.tree.leaves(getattr(instance, field.name))
-        others = [type(leaf).__name__ for leaf in leaves if not eqx.is_array_like(leaf)]
+        others = [_kind(leaf) for leaf in leaves if not eqx.is_array_like(leaf)]
         if not fixed and (kind in FIXED or others):
+            advice = f"declare it as {field.name}: {kind} = static(…), from qfolio.core.fields"
+            if others and any(isinstance(leaf, jax.Array | np.ndarray) for leaf in leaves):
+                advice = "keep its arrays, as from eqx.partition, and make the rest in a method"
             raise QfolioError(
-                f"{field.name} of {name} is {FIXED.get(kind) or f'of type {others[0]}'}, which "
-                f"shapes the program; declare it as {field.name}: {kind} = static(…), from "
-                "qfolio.core.fields."
+                f"{field.name} of {name} {FIXED.get(kind) or others[0]}, which shapes the program; "
+                f"{advice}."
             )
         first = next((each for each in type(instance).__mro__ if field.name in vars(each)), None)
         if first and field.name not in inspect.get_annotations(first):
@@ -123,6 +125,11 @@ def require_static(instance: Any) -> None:
                 f"{field.name}: {kind} = {'static' if fixed else 'number'}(…), from "
                 "qfolio.core.fields."
             )
+
+
+def _kind(leaf: Any) -> str:
+    """What is said of a field with a leaf that is neither a number nor an array."""
+    return "holds a function" if callable(leaf) else f"is of type {type(leaf).__name__}"
 
 
 def require_sizes(instance: Any, name: str = "hidden") -> None:

@@ -33,7 +33,7 @@ from qfolio.core.statistics import regret
 from qfolio.core.training import TrainingState
 from qfolio.experiments.budget import Budget, seed_range, unlearned
 from qfolio.experiments.comparison.ranking import middle_steps, steps_within
-from qfolio.experiments.described import agent_of, describe, plain, task_of
+from qfolio.experiments.described import agent_of, describe, plain, require_described, task_of
 from qfolio.experiments.fit import Listener, Training, fit
 from qfolio.experiments.grading import optimal_returns
 from qfolio.experiments.log import JobLog, Log, seed_names
@@ -228,6 +228,7 @@ def create(plan: Plan, folder: Path, command: str = "") -> None:
 
     command: the command that started it, for the report.
     """
+    require_described("Continual learning", plan.task, plan.changed, plan.agent)
     config = ContinualConfig.of(plan, command)
     with new_folder(folder) as place:
         write_config(place / FILE, config)

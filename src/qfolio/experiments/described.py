@@ -4,6 +4,9 @@ import dataclasses
 import hashlib
 import inspect
 from collections.abc import Mapping
+from datetime import date, timedelta
+from enum import Enum
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,6 +20,15 @@ from qfolio.core.text import quote
 
 OTHERS = "other fields"
 """The key of digests of the fields that are no settings; no field can have this name."""
+
+WHERE = {
+    "task": "as in qfolio.Run.open(folder, task=…)",
+    "agent": "as agent=…, or in agents={…} of a backtest",
+}
+"""How to give what a folder does not hold where the folder is opened."""
+
+PLAIN = (str, bytes, int, float, complex, range, date, timedelta, Enum, type(None))
+"""Types whose values a representation tells apart, in any process."""
 
 
 def describe(task: Task, agent: Agent) -> dict[str, Any]:
@@ -57,6 +69,29 @@ def agent_of(name: str, described: dict[str, Any], given: Agent | None = None) -
     return agent
 
 
+def require_described(whole: str, *parts: Task | Agent) -> None:
+    """Raises QfolioError unless names and settings alone make these tasks and agents again.
+
+    whole: the work that keeps no more of them, such as "A comparison".
+    """
+    for part in parts:
+        kind: Kind = "task" if isinstance(part, Task) else "agent"
+        name, described = name_of(part), recorded(part)
+        takes = f"{whole} takes only what a name and settings describe"
+        try:
+            lost = _differing(build(kind, name, plain(described)), described)
+        except QfolioError:
+            raise QfolioError(
+                f"{takes}, and these do not make the {kind} {name}; define its class outside of "
+                "functions, with a default for each field."
+            ) from None
+        for field in lost:
+            raise QfolioError(
+                f"{takes}, but {field} of the {kind} {name} is no setting, and not its default; "
+                "make it the default of a class of its own."
+            )
+
+
 def _part(
     kind: Kind, base: type, wanted: str, name: str, described: dict[str, Any], given: Any
 ) -> Any:
@@ -66,8 +101,8 @@ def _part(
         for field in _differing(found, described):
             raise QfolioError(
                 f"{field} of the {kind} {name} is no setting, so no folder holds it, and it was "
-                f"not its default; give the {kind} where the folder is opened, as in "
-                f"qfolio.Run.open(folder, {kind}=…)."
+                f"not its default; give the {kind} itself where the folder is opened, "
+                f"{WHERE[kind]}."
             )
         return found
     require_type(kind, given, base, wanted)
@@ -112,22 +147,34 @@ def _digest(content: bytes) -> str:
 def _content(value: Any) -> Any:
     """Text, or tuples of it, which is the same for equal values, also in another process.
 
-    Of what is neither numbers nor text, such as a function, it says the name only.
+    Numbers, text, dates, ranges, arrays and data frames with their labels are told apart, as are
+    dataclasses, partial functions and collections of such. Of a class or function it says the name
+    only, and of anything else that of its class.
     """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    if isinstance(value, type):
+        return value.__qualname__
+    if isinstance(value, np.generic) and value.dtype.kind not in "mM":  # dates have their units
+        value = value.item()
+    if dataclasses.is_dataclass(value):
         each = ((f.name, _content(getattr(value, f.name))) for f in dataclasses.fields(value))
         return type(value).__qualname__, *each
     if isinstance(value, Mapping):
-        return tuple(sorted((repr(key), _content(each)) for key, each in value.items()))
+        return tuple(sorted((_content((key, each)) for key, each in value.items()), key=repr))
+    if isinstance(value, set | frozenset):
+        return tuple(sorted(map(_content, value), key=repr))
     if isinstance(value, list | tuple):
         return tuple(map(_content, value))
-    if isinstance(value, str | int | float | None):
+    if isinstance(value, partial):
+        return _content((value.func, value.args, value.keywords))
+    if isinstance(value, PLAIN):
         return repr(value)
     if isinstance(value, jax.Array) and jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key):
         value = jax.random.key_data(value)
     if hasattr(value, "__array__"):  # of numpy, jax, pandas, …
         array = np.asarray(value)
-        if array.dtype == object:
-            return _content(array.tolist())
-        return array.dtype.str, array.shape, _digest(array.tobytes())
+        labels = _content(getattr(value, "axes", None) or getattr(value, "columns", ()))
+        if not array.dtype.hasobject:
+            return array.dtype.str, array.shape, _digest(array.tobytes()), *labels
+        if array.ndim:
+            return _content(array.tolist()), *labels
     return getattr(value, "__qualname__", type(value).__qualname__)

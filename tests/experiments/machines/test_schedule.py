@@ -193,6 +193,37 @@ def test_a_place_is_used_as_soon_as_there_is_a_job_for_it():
     assert workers.starts == 4
 
 
+def test_places_where_none_starts_are_left_while_more_jobs_wait_than_places():
+    """Two jobs wait for the one place that is left, and one runs."""
+
+    class Together(Simulated):
+        """Says at once what happens at the same time."""
+
+        def receive(self, seconds):
+            heard = super().receive(seconds)
+            while self.events and self.events[0][0] == self.now:
+                heard += super().receive(seconds)
+            return heard
+
+    def jobs():
+        yield Job("long", 1000.0)
+        yield None
+        yield from (Job("b"), Job("c"))
+
+    workers = Together(4, broken=frozenset({1, 2}))
+    assert simulate(workers, jobs())[0].keys() == {"long", "b", "c"}
+    assert workers.starts == 2 + 2 * ATTEMPTS
+
+
+def test_a_good_place_is_tried_after_a_broken_one():
+    """The first batch needs one place only."""
+    workers = Simulated(4, broken=frozenset({0}))
+    assert simulate(workers, [Job("a")])[0] == {"a": "result of a"}
+    assert workers.starts == ATTEMPTS + 1
+    with pytest.raises(QfolioError, match="No worker stays alive"):
+        simulate(Simulated(3, broken=frozenset({0, 1, 2})), [Job("a")])
+
+
 def test_jobs_are_taken_when_a_worker_is_free():
     taken = []
 

@@ -39,7 +39,7 @@ from qfolio.experiments.budget import Budget, seed_range, unlearned
 from qfolio.experiments.comparison.conclusion import conclusion, share
 from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.ranking import Result, rank
-from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.described import agent_of, describe, require_described, task_of
 from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.log import JobLog, Log, add_result, seed_names
@@ -156,7 +156,7 @@ class Comparison:
         """Creates a comparison in which no agent has been trained yet.
 
         Raises QfolioError if an agent does not fit the task or into memory, or its name cannot be
-        that of a folder.
+        that of a folder, or if its settings do not describe it or its task.
 
         Args:
             entrants: Two or more agents, by name.
@@ -173,6 +173,7 @@ class Comparison:
         seed_range(seeds, seed)
         for name, entrant in entrants.items():
             _require_fit(name, entrant, seeds)
+            require_described("A comparison", entrant.task, entrant.agent)
         described = {name: describe(one.task, one.agent) for name, one in entrants.items()}
         tasks = list(dict.fromkeys(entry.pop("task") for entry in described.values()))
         if len(tasks) > 1:

@@ -167,7 +167,7 @@ def drive(
                     workers.start(worker)
                 else:
                     there.remove(worker)
-                    if not there:
+                    if not (there or unused):
                         raise QfolioError(f"No worker stays alive; the last one: {said.why}.")
 
 

@@ -36,7 +36,7 @@ class Schedule(Generic[R]):
         return self._running[worker]
 
     def waiting(self, most: int) -> int:
-        """Number of jobs that wait for a worker; takes jobs for as long as there are fewer."""
+        """Number of jobs that wait for a worker, up to ``most``; takes more until there are."""
         while (count := len(self._again) + len(self._taken)) < most and not self._exhausted:
             try:
                 job = next(self._jobs)
@@ -46,7 +46,7 @@ class Schedule(Generic[R]):
                 if job is None:
                     break
                 self._taken.append(job)
-        return count
+        return min(count, most)
 
     @property
     def running(self) -> int:

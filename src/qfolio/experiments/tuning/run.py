@@ -30,7 +30,7 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.text import finite
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range, unlearned
-from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.described import agent_of, describe, require_described, task_of
 from qfolio.experiments.executor import Executor, Job, carry_out, persistent
 from qfolio.experiments.fit import Listener, Training
 from qfolio.experiments.grading import optimal_returns
@@ -171,9 +171,11 @@ class Tuning:
             out: A new or empty folder.
 
         Raises:
-            QfolioError: A setting is out of range, or the budget ends before learning begins.
+            QfolioError: A setting is out of range, settings do not describe the task or the agent,
+                or the budget ends before learning begins.
         """
         _require_counts(trials=trials, batch=batch, seeds=seeds, fresh_seeds=fresh_seeds)
+        require_described("A search", task, agent)
         config = SearchConfig(
             **describe(task, agent),
             preset=preset,
