@@ -162,6 +162,19 @@ def test_states_may_hold_random_keys():
     assert second.weights()[0] != second.weights()[1]
 
 
+def test_a_restored_training_goes_on_for_several_chunks():
+    """Also with empty arrays, such as the deviations of a policy that chooses."""
+    agent = PPO(hidden=(4,), num_envs=2, rollout_length=4, batch_size=8)
+    first, _ = trained(RewardDelay(), agent, [0, 1], [8])
+    second = Population(RewardDelay(), agent, [0, 1])
+    second.restore(first.fetch())
+    second.advance(8)
+    second.advance(8)
+    straight, _ = trained(RewardDelay(), agent, [0, 1], [24])
+    assert any(leaf.size == 0 for leaf in jax.tree.leaves(second.fetch().agent))
+    assert_same(second.fetch(), straight.fetch())
+
+
 def test_transitions_end_before_the_reset():
     """The buffer of a task whose every transition is known: 0 → 1 → end."""
     agent = DQN(

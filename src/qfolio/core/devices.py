@@ -180,7 +180,11 @@ class Members:
     def place(self, tree: Any) -> Any:
         """Moves leaves with a leading member axis to the devices."""
         slots = jax.tree.map(lambda x: np.asarray(x)[self._filling], tree)
-        return jax.device_put(slots, self._sharding)
+        # Programs return empty arrays undivided, and take them back only like this.
+        undivided = NamedSharding(self._sharding.mesh, PartitionSpec())
+        return jax.device_put(
+            slots, jax.tree.map(lambda x: self._sharding if x.size else undivided, slots)
+        )
 
     def fetch(self, tree: Any) -> Any:
         """Leaves on the devices, as numpy arrays with a leading member axis."""
