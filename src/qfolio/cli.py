@@ -67,10 +67,14 @@ def run() -> NoReturn:
         finally:
             sys.stdout.flush()  # here, where a broken pipe is expected
     except BrokenPipeError:  # such as: qfolio prices table.csv | head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discards the rest
+        _discard()
     except Exception as error:
         if (sentence := told(error)) is None:
             raise
+        try:
+            sys.stdout.flush()
+        except OSError:  # the output is what failed, as on a full disk
+            _discard()
         _refuse(sentence)
     except KeyboardInterrupt:
         print("qfolio: interrupted", file=sys.stderr)
@@ -95,6 +99,8 @@ def _call(words: list[str]) -> None:
     if name and not name.startswith("-"):
         raise QfolioError(f"there is no command {name!r}; {near(name, known)}")
     completing = name in ("--tyro-print-completion", "--tyro-write-completion")
+    if name and not completing and name not in ("-h", "--help"):
+        raise QfolioError(f"there is no option {name}; give a command (see qfolio --help).")
     if completing:
         _prepare_completion(*words[1:])
     overview = {name: _named(summary(command)) for name, command in known.items()}
@@ -123,6 +129,11 @@ def _named(text: str) -> Callable[[], None]:
 
     command.__doc__ = text
     return command
+
+
+def _discard() -> None:
+    """Lets the rest of the output go nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _refuse(sentence: str) -> NoReturn:

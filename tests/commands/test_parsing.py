@@ -98,6 +98,7 @@ def test_the_version(monkeypatch, capsys):
     [
         (["bactest"], "did you mean backtest?"),
         (["xyz"], "choose from backtest, allocate"),
+        (["--resume", "runs"], "qfolio: there is no option --resume; give a command"),
         (["backtest", "--bechmark", "x"], "qfolio backtest --help"),
         (["prices", "--missing", "x"], "qfolio prices --help"),
         (["evaluate"], "qfolio evaluate --help"),
@@ -201,8 +202,21 @@ def test_a_narrow_terminal_folds_names_and_cuts_no_number(monkeypatch, capsys):
     printed = shown.get()
     assert "−23.64%" in printed
     assert "…" not in printed
+    with narrow.capture() as shown:  # where numbers alone fill the width
+        narrow.width = 20
+        console.print_table(("", "growth", "drawdown"), [("a-name", "−123.64%", "88.0%")])
+    assert shown.get().splitlines()[1].split() == ["a-name", "−123.64%", "88.0%"]
+    narrow.width = 50
     console.tell("A sentence with words that are longer than the terminal is wide, by far.")
     assert capsys.readouterr().out.split("\n")[0].endswith(" longer than the")
+
+
+def test_a_dumb_terminal_is_told_like_a_file(monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setattr(console, "console", Console(force_terminal=True, color_system=None))
+    with console.working("Writing"):
+        pass
+    assert capsys.readouterr().out.startswith("Writing.\n")
 
 
 @pytest.mark.parametrize("terminal", [True, False])

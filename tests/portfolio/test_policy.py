@@ -89,6 +89,8 @@ def test_it_comes_back_from_disk(policy, tmp_path):
     assert kept.weights(table()) == policy.weights(table())
     assert same(kept.learner, policy.learner)
     assert kept.learned == policy.learned == np.datetime64("2020-02-29")
+    assert repr(kept).endswith(" on 3 assets, 2 seeds, learned until 2020-02-29>")
+    assert repr(table()) == "<Prices: 80 rows of 3 assets, 2020-01-01 to 2020-03-20>"
     updated, kept_updated = (p.update(table(), 8) for p in (policy, kept))
     assert same(updated.learner, kept_updated.learner)
     updated.save(tmp_path / "updated")

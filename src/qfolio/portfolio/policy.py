@@ -126,6 +126,11 @@ class Policy:
         self.assets, self.features = tuple(assets), tuple(features)
         self.learner, self.updates, self.learned = learner, updates, learned
 
+    def __repr__(self) -> str:
+        of = f"{amount(len(self.assets), 'asset')}, {amount(self.seeds, 'seed')}"
+        when = "" if np.isnat(self.learned) else f", learned until {day(self.learned)}"
+        return f"<Policy: {type(self.agent).__name__} on {of}{when}>"
+
     def weights(
         self, prices: Any, holdings: Any = None, *, spent: float = 0.0, **options: Any
     ) -> dict[str, float]:

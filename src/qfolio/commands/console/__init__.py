@@ -7,15 +7,25 @@ from textwrap import wrap
 from typing import Literal
 
 import rich.progress
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from qfolio.core.text import printable
 
+NAME, GAP = 16, 2
+"""Characters that the names of a table's rows have at least, if they need them, and those between
+two columns."""
+
 console = Console(highlight=False)
 if not console.is_terminal:
     console.width = 10_000  # files and pipes have no width: nothing is folded there
+
+
+def moves() -> bool:
+    """Whether lines can be drawn again: in a terminal that is not dumb."""
+    return console.is_terminal and not console.is_dumb_terminal
 
 
 def say(*lines: str) -> None:
@@ -33,8 +43,8 @@ def tell(sentences: str) -> None:
 
 @contextlib.contextmanager
 def working(text: str) -> Iterator[None]:
-    """Says what is being done: in a terminal until it is, in a file or pipe once."""
-    if not console.is_terminal:
+    """Says what is being done: where lines can move until it is, elsewhere once."""
+    if not moves():
         say(f"{text}.")
     with console.status(text):
         yield
@@ -42,7 +52,7 @@ def working(text: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def bar(text: str, total: float = 1.0) -> Iterator[Callable[..., None]]:
-    """A bar with text beside it, on terminals only, removed at the end.
+    """A bar with text beside it, where lines can move, removed at the end.
 
     Yields the function that moves it: ``update(completed=…)``, with ``description=…`` for new text.
     """
@@ -51,7 +61,7 @@ def bar(text: str, total: float = 1.0) -> Iterator[Callable[..., None]]:
         rich.progress.TextColumn("{task.description}"),
     )
     with rich.progress.Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
+        *columns, console=console, transient=True, disable=not moves()
     ) as live:
         yield partial(live.update, live.add_task(text, total=total))
 
@@ -65,6 +75,9 @@ def print_table(
 ) -> None:
     """A table; its first column names the rows, and numbers in the others are aligned.
 
+    A narrow terminal folds the names. Where even that is too little, lines are longer than the
+    terminal is wide: no name is left out, and no digit cut off.
+
     Args:
         heads: The columns' names.
         rows: Their cells.
@@ -74,11 +87,15 @@ def print_table(
     table = Table(box=None, header_style="bold", pad_edge=False)
     for i, head in enumerate(heads):
         side: Literal["left", "right"] = "right" if i else "left"
-        # On a narrow terminal names are folded, so that no digit is cut off.
-        whole = i > 0
         name = Text(printable(head))
-        table.add_column(name, justify=side, no_wrap=whole, overflow="fold", min_width=width)
+        table.add_column(name, justify=side, no_wrap=i > 0, overflow="fold", min_width=width)
+    longest = [cell_len(printable(head)) for head in heads]
     for row in rows:
-        cells = (Text(printable(cell)) for cell in row)
+        cells = [Text(printable(cell)) for cell in row]
         table.add_row(*cells, style="bold" if row[0] in bold else None)
-    console.print(table)
+        longest = [max(each) for each in zip(longest, (c.cell_len for c in cells), strict=True)]
+    names, *numbers = longest
+    needed = min(names, NAME) + sum(max(each, width) + GAP for each in numbers)
+    if needed > console.width:
+        table.width = needed
+    console.print(table, crop=False)

@@ -38,7 +38,7 @@ DEFAULT_TRIALS = 250
 """Earlier trials on the default table, as docs/results/real_prices.md lists them."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Prices:
     """A checked price table; its arrays are read-only.
 
@@ -126,6 +126,11 @@ class Prices:
 
     def __len__(self) -> int:
         return len(self.dates)
+
+    def __repr__(self) -> str:
+        what = f"{amount(len(self), 'row')} of {amount(len(self.assets), 'asset')}"
+        when = f", {day(self.dates[0])} to {day(self.dates[-1])}" if len(self) else ""
+        return f"<Prices: {what}{when}>"
 
     @property
     def masks(self) -> dict[str, np.ndarray]:
