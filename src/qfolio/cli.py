@@ -15,6 +15,18 @@ from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 SHELLS = ("bash", "zsh", "fish")
 """Shells whose completion can be installed."""
 
+FILES = r"""# Files and folders, where there is nothing else, or only options, to offer.
+_qfolio() {
+  local cur="${COMP_WORDS[COMP_CWORD]}"
+  _tyro_qfolio "$@"
+  if [[ "$cur" != -* && $COMP_CWORD -gt 1 && "${COMPREPLY[0]}" =~ ^(-.*)?$ ]]; then
+    local IFS=$'\n'
+    COMPREPLY=($(compgen -f -- "$cur"))
+  fi
+}
+complete -o filenames -F _qfolio qfolio"""
+"""What tyro's completion for bash lacks: it offers an empty word where it knows none."""
+
 ABOUT = """Reinforcement learning for portfolio optimization, graded against exact optima.
 
 Examples:
@@ -104,12 +116,17 @@ def _call(words: list[str]) -> None:
     if completing:
         _prepare_completion(*words[1:])
     overview = {name: _named(summary(command)) for name, command in known.items()}
-    tyro.extras.subcommand_cli_from_dict(
-        known if completing else overview,
-        prog="qfolio",
-        description=ABOUT,
-        args=words or ["--help"],
-    )
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            known if completing else overview,
+            prog="qfolio",
+            description=ABOUT,
+            args=words or ["--help"],
+        )
+    except SystemExit as done:
+        if completing and words[1:2] == ["bash"] and not done.code:
+            _complete_files(*words[2:3])
+        raise
 
 
 def _prepare_completion(shell: str = "bash", script: str | None = None, *_: str) -> None:
@@ -120,6 +137,15 @@ def _prepare_completion(shell: str = "bash", script: str | None = None, *_: str)
         raise QfolioError(f"{shell!r} gets no completion; {near(shell, SHELLS)}")
     if script is not None:
         Path(script).parent.mkdir(parents=True, exist_ok=True)
+
+
+def _complete_files(script: str | None = None) -> None:
+    """Adds to tyro's completion for bash, in a script or as printed, what it lacks."""
+    if script is None:
+        print(FILES)
+        return
+    with open(script, "a", encoding="utf-8") as file:
+        file.write(f"\n{FILES}\n")
 
 
 def _named(text: str) -> Callable[[], None]:

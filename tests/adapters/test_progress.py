@@ -63,6 +63,15 @@ def test_the_time_left_of_a_resumed_training_follows_from_what_was_done_since(sh
         assert "0:00:30 left" in shown[-1]
 
 
+def test_a_training_that_was_stopped_does_not_seem_to_go_on(shown):
+    with qfolio.tracked(qfolio.Progress()), Log(None).opened(kind="run") as log:
+        log.write("running", job="")
+        log.job("").record(5, {}, share=0.5)
+        log.settle(finished=False)
+    assert shown[-1].endswith("stopped</div>")
+    assert "left" not in shown[-1]
+
+
 def test_hostile_names_stay_text(shown):
     train("<img src=x onerror=alert(1)>")
     assert "&lt;img" in shown[-1]

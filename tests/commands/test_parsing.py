@@ -166,11 +166,15 @@ class Output:
 
 def test_bash_completes_commands_and_options(monkeypatch, tmp_path):
     script = tmp_path / "new" / "qfolio"
+    (tmp_path / "table.csv").touch()
     assert typed(monkeypatch, "--tyro-write-completion", "bash", script) is None
     assert typed(monkeypatch, "--tyro-write-completion", "tcsh", tmp_path / "other") == 2
     for words, completed in (
         (["qfolio", "backt"], "backtest"),
         (["qfolio", "prices", "--miss"], "--missing"),
+        (["qfolio", "prices", "--missing", "drop"], "drop-asset"),
+        (["qfolio", "prices", f"{tmp_path}/ta"], f"{tmp_path}/table.csv"),
+        (["qfolio", "report", f"{tmp_path}/n"], f"{tmp_path}/new"),
     ):
         line = " ".join(words)
         asked = (

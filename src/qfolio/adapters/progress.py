@@ -33,7 +33,7 @@ class Progress(Tracker):
         self._name = " on ".join(filter(None, (agents, str(about.get("task", "")))))
         self._jobs: dict[str, float] = {}  # finished share of each
         self._before: dict[str, float] = {}  # the same, when it was resumed
-        self._text, self._begun, self._shown = "", perf_counter(), 0.0
+        self._text, self._begun, self._shown, self._state = "", perf_counter(), 0.0, ""
         self._show, self._close = _in_notebook() or _on_terminal()
 
     def event(self, event: Mapping[str, Any]) -> None:
@@ -51,6 +51,8 @@ class Progress(Tracker):
             known = [x for x in values if x is not None and math.isfinite(x)]
             mean = f"return {sum(known) / len(known):.4g}" if known else ""
             self._text = "  ".join(filter(None, (mean, rate))) or self._text
+        elif kind == "end" and event["state"] != "done":
+            self._state = event["state"]
         if kind == "end" or perf_counter() - self._shown > EVERY:
             self._shown = perf_counter()
             self._show(self._done, self._said)
@@ -69,7 +71,8 @@ class Progress(Tracker):
         left = datetime.timedelta(seconds=round(spent * (1 - done) / here)) if here > 0 else None
         jobs = f"{sum(x == 1 for x in self._jobs.values())} of {len(self._jobs)} jobs"
         parts = [self._name, f"{done:.0%}", jobs if len(self._jobs) > 1 else "", self._text]
-        parts.append("" if left is None else f"{left} left" if done < 1 else f"{spent:.1f} s")
+        time = "" if left is None else f"{left} left" if done < 1 else f"{spent:.1f} s"
+        parts.append(self._state or time)
         return printable("  ".join(filter(None, parts)))
 
 

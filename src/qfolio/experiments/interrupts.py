@@ -29,7 +29,8 @@ _resumes: list[str] = []
 _last_acts: list[Callable[[], object]] = []
 """What is done when Ctrl-C ends the process, from a thread beside the work."""
 
-_SHOW_CURSOR = "\x1b[?25h"
+_NEW_LINE = "\r\x1b[2K\x1b[?25h"
+"""What clears the line of a bar, and shows the cursor again."""
 
 
 @contextlib.contextmanager
@@ -98,10 +99,10 @@ def _leave() -> None:
     for act in [*_last_acts]:  # of which the main thread may remove some
         with contextlib.suppress(Exception):
             act()
-    cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
+    start = _NEW_LINE if sys.stderr.isatty() else ""
     advice = f". Resume with: {printable(_resumes[-1])}" if _resumes else ""
     with contextlib.suppress(OSError):
-        os.write(2, f"{cursor}qfolio: interrupted{advice}\n".encode())
+        os.write(2, f"{start}qfolio: interrupted{advice}\n".encode())
     os._exit(EXIT_CODE)
 
 
