@@ -6,7 +6,7 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import TYPE_CHECKING, NoReturn
 
-from qfolio.commands.console import moves, say
+from qfolio.commands.console import animated, say
 from qfolio.core.text import four_digits
 from qfolio.core.training import episode_steps
 from qfolio.experiments.fit import Listener, Training
@@ -114,7 +114,7 @@ class JobsProgress:
         left = time_left(spent * (1 - done) / here if self.known and here > 0 else math.nan)
         description = f"{agent}  {left} left"
         self.update(completed=done, description=description)
-        if not moves() and f"{done:.1f}" != self.said:
+        if not animated() and f"{done:.1f}" != self.said:
             self.said = f"{done:.1f}"
             say(f"{done:4.0%}  {description}")
 

@@ -23,7 +23,7 @@ if not console.is_terminal:
     console.width = 10_000  # files and pipes have no width: nothing is folded there
 
 
-def moves() -> bool:
+def animated() -> bool:
     """Whether lines can be drawn again: in a terminal that is not dumb."""
     return console.is_terminal and not console.is_dumb_terminal
 
@@ -44,7 +44,7 @@ def tell(sentences: str) -> None:
 @contextlib.contextmanager
 def working(text: str) -> Iterator[None]:
     """Says what is being done: where lines can move until it is, elsewhere once."""
-    if not moves():
+    if not animated():
         say(f"{text}.")
     with console.status(text):
         yield
@@ -61,7 +61,7 @@ def bar(text: str, total: float = 1.0) -> Iterator[Callable[..., None]]:
         rich.progress.TextColumn("{task.description}"),
     )
     with rich.progress.Progress(
-        *columns, console=console, transient=True, disable=not moves()
+        *columns, console=console, transient=True, disable=not animated()
     ) as live:
         yield partial(live.update, live.add_task(text, total=total))
 
