@@ -42,7 +42,7 @@ WRONG_TYPES = {
     "Backtest.create(prices, {'dqn': DQN()}, task=3)": "task is 3; it must be a dictionary of",
     "Backtest.create(prices, agents, out=3)": "out is 3; it must be a path, such as",
     "Backtest.open(3)": "folder is 3; it must be a path, such as",
-    "Study.create(prices, agents, out='nowhere')": "tables is Prices(",
+    "Study.create(prices, agents, out='nowhere')": "tables is <Prices: ",
     "Study.create({'a': prices}, agents, train=4, out='nowhere')": "A length is 4; it must be",
     "Study.create({'a': prices}, agents, lags=1, out='nowhere')": "lags is 1; it must be a list",
     "Study.create({'a': prices}, agents, costs=.1, out='nowhere')": "costs is 0.1; it must be a",
