@@ -2,15 +2,13 @@
 
 import dataclasses
 import json
-import sys
-from types import SimpleNamespace
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
 
+from leaning import Leaning
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.agents.tilts import Tilts
@@ -106,18 +104,7 @@ def test_one_with_an_anchor_comes_back_from_disk(tmp_path):
     assert Policy.open(tmp_path / "kept").weights(table()) == kept.weights(table())
 
 
-class Leaning(Pathwise):
-    """Leans towards some weights, which are no setting."""
-
-    towards: np.ndarray = eqx.field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
-
-    def policy(self, weights, observation):
-        return 0.5 * super().policy(weights, observation) + 0.5 * self.towards
-
-
-def test_what_a_folder_does_not_hold_is_not_taken_from_the_defaults(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "leaning", SimpleNamespace(Leaning=Leaning))
-    monkeypatch.setattr(Leaning, "__module__", "leaning")
+def test_what_a_folder_does_not_hold_is_not_taken_from_the_defaults(tmp_path):
     agent = Leaning(rollout_length=5, num_envs=4, hidden=(8,), towards=np.array([0.0, 0, 0, 1]))
     kept = learned("pathwise", agent, episodes=2, seeds=1)
     kept.save(tmp_path / "kept")

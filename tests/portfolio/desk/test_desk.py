@@ -2,17 +2,14 @@
 
 import datetime
 import shutil
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 import pandas as pd
 import pytest
 
-from qfolio.agents.pathwise import Pathwise
+from leaning import Leaning
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk
@@ -162,18 +159,7 @@ def test_an_allocation_that_fails_removes_its_own_policy_alone(finished, tmp_pat
     assert (own.exists(), other.exists()) == (False, True)
 
 
-class Leaning(Pathwise):
-    """Leans towards some weights, which are no setting."""
-
-    towards: np.ndarray = eqx.field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
-
-    def policy(self, weights, observation):
-        return 0.5 * super().policy(weights, observation) + 0.5 * self.towards
-
-
-def test_an_agent_that_the_folder_cannot_restore_is_given(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "leaning", SimpleNamespace(Leaning=Leaning))
-    monkeypatch.setattr(Leaning, "__module__", "leaning")
+def test_an_agent_that_the_folder_cannot_restore_is_given(tmp_path):
     agent = Leaning(**PATHWISE.settings, towards=np.array([0.0, 0.0, 0.0, 1.0]))
     folder, prices = tmp_path / "run", load(write_table(tmp_path / "prices.csv"))
     Backtest.create(

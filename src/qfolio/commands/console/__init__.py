@@ -7,7 +7,6 @@ from textwrap import wrap
 from typing import Literal
 
 import rich.progress
-from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -85,16 +84,14 @@ def print_table(
         width: Characters that each column has at least.
     """
     table = Table(box=None, header_style="bold", pad_edge=False)
-    for i, head in enumerate(heads):
+    rows = [*rows]
+    lines = [[Text(printable(cell)) for cell in line] for line in (heads, *rows)]
+    for i, head in enumerate(lines[0]):
         side: Literal["left", "right"] = "right" if i else "left"
-        name = Text(printable(head))
-        table.add_column(name, justify=side, no_wrap=i > 0, overflow="fold", min_width=width)
-    longest = [cell_len(printable(head)) for head in heads]
-    for row in rows:
-        cells = [Text(printable(cell)) for cell in row]
+        table.add_column(head, justify=side, no_wrap=i > 0, overflow="fold", min_width=width)
+    for row, cells in zip(rows, lines[1:], strict=True):
         table.add_row(*cells, style="bold" if row[0] in bold else None)
-        longest = [max(each) for each in zip(longest, (c.cell_len for c in cells), strict=True)]
-    names, *numbers = longest
+    names, *numbers = (max(each.cell_len for each in column) for column in zip(*lines, strict=True))
     needed = min(names, NAME) + sum(max(each, width) + GAP for each in numbers)
     if needed > console.width:
         table.width = needed
