@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from qfolio.experiments.run import Run as Run
     from qfolio.experiments.run import train as train
     from qfolio.portfolio.backtest.run import Backtest as Backtest
+    from qfolio.portfolio.desk.desk import Desk as Desk
     from qfolio.portfolio.policy import Policy as Policy
     from qfolio.portfolio.prices.table import load as load_prices  # noqa: F401
     from qfolio.portfolio.study.run import Study as Study
@@ -53,6 +54,7 @@ _HOMES = {
     "Budget": "qfolio.experiments.budget:Budget",
     "DDPG": "qfolio.agents.ddpg:DDPG",
     "DQN": "qfolio.agents.dqn:DQN",
+    "Desk": "qfolio.portfolio.desk.desk:Desk",
     "FiniteMDP": "qfolio.tasks.finite:FiniteMDP",
     "Listener": "qfolio.experiments.fit:Listener",
     "PPO": "qfolio.agents.ppo:PPO",

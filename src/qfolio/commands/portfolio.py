@@ -65,7 +65,7 @@ def backtest(
     from qfolio.core.files import read_json
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
-    from qfolio.portfolio.backtest.notes import mandated, shortened, unread
+    from qfolio.portfolio.backtest.notes import beforehand
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.report.backtest.finish import finish
 
@@ -91,8 +91,7 @@ def backtest(
             "with more rows."
         )
     console.say(describe_backtest(run))
-    short = shortened(run.config.agents, run.replay)
-    for note in (*short, *mandated(run.replay), *unread(run.replay)):
+    for note in beforehand(run.config.agents, run.replay):
         console.tell(note)
     resume = again("qfolio backtest --resume", folder, *run.parts, on=options.on)
     status = "Replaying all strategies, explaining the agents and writing the report"

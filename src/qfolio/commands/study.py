@@ -55,7 +55,7 @@ def study(
     from qfolio.commands.progress import JobsProgress, stop
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
-    from qfolio.portfolio.backtest.notes import shortened
+    from qfolio.portfolio.backtest.notes import beforehand
     from qfolio.portfolio.study.run import Study
     from qfolio.report.backtest.finish import write_page
     from qfolio.report.study import write_study_report
@@ -86,7 +86,7 @@ def study(
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1
             console.say(f"{place} of {len(run.places)}: {table}, {variant.text}")
-            for note in shortened(backtest.config.agents, backtest.replay):
+            for note in beforehand(backtest.config.agents, backtest.replay):
                 console.tell(note)
             return JobsProgress(update)
 

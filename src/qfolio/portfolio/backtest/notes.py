@@ -22,6 +22,11 @@ BARELY = 1e-3
 """Risk that exceeds a limit by a smaller share of it is a rounding error."""
 
 
+def beforehand(agents: Mapping[str, AgentConfig], replay: Replay) -> list[str]:
+    """What is known of a backtest's settings before it is run."""
+    return [*shortened(agents, replay), *mandated(replay), *unread(replay)]
+
+
 def shortened(agents: Mapping[str, AgentConfig], replay: Replay) -> list[str]:
     """A note on each agent whose episodes are shorter than its preset's."""
     rows = fewest(replay.folds, replay.prices)

@@ -428,10 +428,9 @@ class Backtest:
         others, said = replay.others(self.baselines, self._own, self.config.benchmark)
         entries = {name: entry for each in (*found, others) for name, entry in each.items()}
         return entries, [
-            *notes.shortened(self.config.agents, replay),
+            *notes.beforehand(self.config.agents, replay),
             *notes.unknown(self.tasks, self.folds),
             *notes.left_out(replay),
-            *notes.mandated(replay),
             *said,
             *notes.too_risky(replay, entries),
             *notes.called(replay, entries, self._own),

@@ -6,7 +6,7 @@ like a split, or like another unit. Any other is left for the reader to judge, u
 price moves by as much, or it is about to be traded.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,8 @@ EXACT = 0.005  # how far a jump's ratio may be from one of these
 HALF = (2.0, 0.035)
 RARE = (6.0, 0.1)
 ABSURD = 5.0  # a rise to so many times the price before is doubtful at any ratio; firms do fail
+
+EMPTY_IT = "If so, correct it, or empty the cell and choose missing='forward-fill' (--missing)."
 
 Jump = tuple[int, int]  # the row before the jump, and the asset
 
@@ -59,39 +61,42 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
         )  # fmt: skip
     findings.others("error", len(wild), "price", " that change by such factors")
     ticks, splits, others = _sort_out(logs, moves, _jumps(values, moves, sizes))
-    for (i, j), rows in list(ticks.items())[-LISTED:]:
-        spell = "in the next row" if rows == 1 else f"{rows} rows later"
-        power = round(np.log10(relatives[i, j]))
-        misplaced = power and abs(moves[i, j] - power * np.log(10)) < LEAST_JUMP
-        findings.warn(
-            f"{subject(j)} is {relatives[i, j]:.4g} times the one before and goes back {spell}: "
-            f"perhaps a wrong price{', a digit or the decimal mark misplaced' * bool(misplaced)}",
-            advice="If so, correct it, or empty the cell and choose missing='forward-fill' "
-            "(--missing).",
-            **spot(i + 1, j),
-        )
-    findings.older([spot(i + 1, j) for i, j in ticks], "price", "that may be wrong")
-    for (i, j), ratio in list(splits.items())[-LISTED:]:
-        unit = ratio.strip("0") in ("1", "1/1")  # a power of ten
-        findings.warn(
-            f"{subject(j)} is {relatives[i, j]:.4g} times the one before, close to {ratio}: "
-            "perhaps a split that was not adjusted",
-            advice="If so, use adjusted prices; "
+
+    def warn(jumps: Iterable[Jump], say: Callable[[Jump], tuple[str, str]], *rest: str) -> None:
+        """Warnings on the latest of some jumps, and the number of the others."""
+        every = [(jump, spot(jump[0] + 1, jump[1])) for jump in jumps]
+        for jump, where in every[-LISTED:]:
+            said, advice = say(jump)
+            message = f"{subject(jump[1])} is {relatives[jump]:.4g} times the one before{said}"
+            findings.warn(message, advice=advice, **where)
+        findings.older([where for _, where in every], *rest)
+
+    def tick(jump: Jump) -> tuple[str, str]:
+        spell = "in the next row" if ticks[jump] == 1 else f"{ticks[jump]} rows later"
+        power = round(np.log10(relatives[jump]))
+        misplaced = power and abs(moves[jump] - power * np.log(10)) < LEAST_JUMP
+        how = ", a digit or the decimal mark misplaced" if misplaced else ""
+        return f" and goes back {spell}: perhaps a wrong price{how}", EMPTY_IT
+
+    def split(jump: Jump) -> tuple[str, str]:
+        unit = splits[jump].strip("0") in ("1", "1/1")  # a power of ten
+        return f", close to {splits[jump]}: perhaps a split that was not adjusted", (
+            "If so, use adjusted prices; "
             + "if the unit changed, as from pence to pounds, convert it; " * unit
-            + "if the price did move like this, leave it.",
-            **spot(i + 1, j),
+            + "if the price did move like this, leave it."
         )
-    findings.older([spot(i + 1, j) for i, j in splits], "move", "that may be splits")
+
+    def doubt(jump: Jump) -> tuple[str, str]:
+        return (
+            ", which neither other assets nor a usual split explain: perhaps a wrong price",
+            "If so, correct it; if the price did move like this, leave it.",
+        )
+
     newest = len(moves) - max(1, round(periods_per_year(dates) / 12))  # the last month begins
     doubtful = [jump for jump in others if jump[0] >= newest or moves[jump] > np.log(ABSURD)]
-    for i, j in doubtful[-LISTED:]:
-        findings.warn(
-            f"{subject(j)} is {relatives[i, j]:.4g} times the one before, which neither other "
-            "assets nor a usual split explain: perhaps a wrong price",
-            advice="If so, correct it; if the price did move like this, leave it.",
-            **spot(i + 1, j),
-        )
-    findings.older([spot(i + 1, j) for i, j in doubtful], "move", "that nothing explains")
+    warn(ticks, tick, "price", "that may be wrong")
+    warn(splits, split, "move", "that may be splits")
+    warn(doubtful, doubt, "move", "that nothing explains")
     others = sorted(set(others) - set(doubtful), key=lambda jump: -sizes[jump])
     if others:
         (i, j), *further = others
