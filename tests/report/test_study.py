@@ -44,7 +44,7 @@ def test_a_table_alone_is_not_pooled(costs, capsys):
     for text in (capsys.readouterr().out, page.text):
         for word in ("pool", "stouffer", "1 table", "tables", "table by table"):
             assert word not in text.lower().replace("in tables/", "")
-        assert "in growth after costs on table-1: the difference in annual growth is" in text
+        assert "in growth after costs on table-1: the difference in annual log growth is" in text
         assert "earlier looks at its table are known" in text
 
 

@@ -35,3 +35,14 @@ def test_a_table_without_such_columns():
         price_table(random_walk(160)), {"pathwise": PATHWISE}, train="80d", test="40d", baselines=[]
     )
     assert notes.unread(run.replay) == []
+
+
+@pytest.mark.parametrize(("days", "said"), [(1, True), (30, False)])
+def test_figures_a_year_of_a_short_test(days: int, said: bool):
+    start = np.datetime64("2000-01-31")
+    prices = price_table(random_walk(160), dates=start + days * np.arange(160))
+    run = Backtest.create(prices, {"pathwise": PATHWISE}, train="80d", test="40d", baselines=[])
+    found = notes.brief(run.replay)
+    assert bool(found) is said
+    if said:
+        assert "where a year has about 365: figures a year are extrapolated" in found[0]

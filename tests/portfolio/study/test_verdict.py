@@ -37,34 +37,34 @@ def pools(reference, alone, best, tables=("us", "eu")):
             "better",
             "better",
             "tilts beats equal-weight, however it is rebalanced, in growth after costs over 2 "
-            "tables: the mean difference in annual growth is +2.00%",
+            "tables: the mean difference in annual log growth is +2.00%",
             "Against equal-weight itself, rebalanced as often as it may be: the mean difference "
-            "in annual growth is +3.00%",
+            "in annual log growth is +3.00%",
         ),
         # On random walks, an agent that merely trades less grows more than daily equal weights.
         (
             "better",
             "none",
             "No evidence that tilts beats the best rebalancing of equal-weight in growth after "
-            "costs over 2 tables: the mean difference in annual growth is +2.00%",
+            "costs over 2 tables: the mean difference in annual log growth is +2.00%",
             "It beats equal-weight itself, as trading less may do without any skill: the mean "
-            "difference in annual growth is +3.00%",
+            "difference in annual log growth is +3.00%",
         ),
         (
             "worse",
             "none",
             "tilts falls short of equal-weight in growth after costs over 2 tables: the mean "
-            "difference in annual growth is +3.00%",
-            "Against the best rebalancing of equal-weight: the mean difference in annual growth "
-            "is +2.00%",
+            "difference in annual log growth is +3.00%",
+            "Against the best rebalancing of equal-weight: the mean difference in annual log "
+            "growth is +2.00%",
         ),
         (
             "none",
             "none",
             "No evidence that tilts beats equal-weight in growth after costs over 2 tables: the "
-            "mean difference in annual growth is +3.00%",
-            "Against the best rebalancing of equal-weight: the mean difference in annual growth "
-            "is +2.00%",
+            "mean difference in annual log growth is +3.00%",
+            "Against the best rebalancing of equal-weight: the mean difference in annual log "
+            "growth is +2.00%",
         ),
     ],
 )
@@ -87,7 +87,7 @@ def test_another_reference_has_one_speed():
 
 def test_a_table_alone_is_named_and_not_pooled():
     assert verdicts({"tilts": pools("fund", "better", "better", ["us"])})["tilts"] == [
-        "tilts beats fund in growth after costs on us: the difference in annual growth is +3.00% "
-        "(95% interval +2.00% to +4.00%); z is +3.00, corrected p = 0.020.",
+        "tilts beats fund in growth after costs on us: the difference in annual log growth is "
+        "+3.00% (95% interval +2.00% to +4.00%); z is +3.00, corrected p = 0.020.",
         "Its Sharpe ratio less that of the best baseline, seen in hindsight, is −0.10 (z −0.50).",
     ]

@@ -30,7 +30,7 @@ def test_figures_are_means_over_seeds() -> None:
     assert rows["Sharpe ratio"][0] == number(
         data.assessment.strategies["DQN"].measures["sharpe"].mean, 2
     )
-    assert rows["Alpha a year, beside equal weight"][1] == "0.00%"
+    assert rows["Alpha a year, beside equal weight before costs"][1][0] == "−"  # its costs
     assert rows["Gross leverage"][0] == number(
         float((1 - data.strategies["DQN"].weights[:, 0]).mean()), 2
     )
@@ -74,11 +74,25 @@ def test_value_at_risk_is_the_same_everywhere() -> None:
 def test_interest_on_cash_is_no_alpha() -> None:
     data, rate = usual(300), np.full(300, 0.05 / 252)
     market = data.strategies["equal weight"]
-    half = replace(market, returns=(market.returns + rate) / 2)
+    gross = (1 + market.returns) / (1 - market.cost) - 1
+    half = replace(market, returns=(gross + rate) / 2)
     data = replace(data, strategies={**data.strategies, "third": half}, risk_free=rate)
     sheet = tear_sheet(["third"], data)
     rows = {name: cells for _, group in sheet["groups"] for name, cells in group}
-    assert rows["Alpha a year, beside equal weight"] == ["0.00%"]
+    assert rows["Alpha a year, beside equal weight before costs"] == ["0.00%"]
+
+
+def test_the_costs_of_the_reference_are_no_alpha() -> None:
+    data = usual(300)
+    market = data.strategies["equal weight"]
+    cost = np.full_like(market.cost, 0.001)
+    idle = replace(market, returns=(1 + market.returns) / (1 - cost) - 1, cost=0 * cost)
+    data = replace(data, strategies={"equal weight": replace(market, cost=cost), "DQN": idle})
+    sheet = tear_sheet(["DQN", "equal weight"], data)
+    rows = {name: cells for _, group in sheet["groups"] for name, cells in group}
+    skilled, paying = rows["Alpha a year, beside equal weight before costs"]
+    assert skilled == "0.00%"
+    assert paying.startswith("−2")  # 0.1% a day is 25% a year
 
 
 def test_net_exposure_of_short_positions() -> None:

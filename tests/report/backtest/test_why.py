@@ -28,7 +28,8 @@ def test_the_page_says_where_the_return_came_from(explained):
         "and +1.1% from timing (t = 1.7 for the two together), less 0.4% in costs.",
         "Diagnosis: DQN-together traded once and never again.",
         "with constant tilts, t = 1.7",
-        "Returns less those of equal weight, regressed on factors made from the table. R² 31%",
+        "Net returns less those of equal weight before its costs, regressed on factors made from "
+        "the table. R² 31%",
         "Worth: 3 shuffles of each signal, the mean of all seeds, 10 replays in all.",
         "The linear rule explains 64% of the active weights",
         "volatility:21 shared by all assets",

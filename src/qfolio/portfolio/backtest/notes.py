@@ -69,6 +69,17 @@ def unread(replay: Replay) -> list[str]:
     ]
 
 
+def brief(replay: Replay) -> list[str]:
+    """A note on a test of less than a year, of which figures a year say little."""
+    days, year = len(replay.rows), replay.prices.periods_per_year
+    if days >= 0.95 * year:  # a year of a calendar has a few more or fewer
+        return []
+    return [
+        f"The test has {amount(days, 'row')}, where a year has about {year:.0f}: figures a year "
+        "are extrapolated, and turnover and cost a year repeat the first purchase."
+    ]
+
+
 def left_out(replay: Replay) -> list[str]:
     """A note on each fold that leaves out assets, or one on all that are delisted."""
     listed, assets = replay.prices.listed, replay.prices.assets

@@ -431,6 +431,7 @@ class Backtest:
             *notes.beforehand(self.config.agents, replay),
             *notes.unknown(self.tasks, self.folds),
             *notes.left_out(replay),
+            *notes.brief(replay),
             *said,
             *notes.too_risky(replay, entries),
             *notes.called(replay, entries, self._own),

@@ -60,7 +60,7 @@ def _numbers(pooled: Pooled, threshold: float, tables: int) -> str:
         chance += f", but luck is expected to reach a z of {decimal(threshold)} after all looks"
     difference, z = ("difference", "z") if tables == 1 else ("mean difference", "Stouffer’s z")
     return (
-        f"the {difference} in annual growth is {growth_text(pooled.growth)} ({interval}); "
+        f"the {difference} in annual log growth is {growth_text(pooled.growth)} ({interval}); "
         f"{z} is {decimal(pooled.z)}{chance}"
     )
 

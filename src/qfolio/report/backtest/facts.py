@@ -26,11 +26,19 @@ def key_facts(data: BacktestData) -> list[str]:
         f"{test.first_date} to {test.last_date} ({years} years)",
         f"{amount(len(data.assets), 'asset')} and cash",
         *_universe(data.prices),
-        f"{basis_points(settings['cost'])} of the value traded",
+        _cost(settings),
         f"lag of {amount(settings['lag'], unit)}",
         amount(len(data.folds), "fold"),
         amount(test.trials, "trial"),
     ]
+
+
+def _cost(settings: dict[str, Any]) -> str:
+    """What a trade costs, in a few words; itemized costs have parts that no rate sums up."""
+    rate = basis_points(settings["cost"])
+    if settings["cost_model"] == PROPORTIONAL:
+        return f"{rate} of the value traded"
+    return f"{rate} of commission, itemized costs" if settings["cost"] else "itemized costs"
 
 
 def _universe(prices: dict[str, Any]) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 from qfolio.core.arrays import Floats
 from qfolio.core.text import plural
 from qfolio.portfolio.backtest.folds import spell
+from qfolio.portfolio.backtest.statistics.measures import before_costs
 from qfolio.portfolio.backtest.statistics.tearsheet import (
     alpha,
     contributions,
@@ -63,7 +64,8 @@ def tear_sheet(names: list[str], data: BacktestData) -> dict[str, Any]:
 def _means(name: str, data: BacktestData, year: float) -> dict[str, float]:
     """Figures of a strategy; ratios over what cash earns are those of its assessment."""
     series, test, cash = data.strategies[name], data.assessment, data.risk_free
-    reference = data.strategies[test.reference].returns.mean(axis=0) - cash
+    rival = data.strategies[test.reference]
+    reference = before_costs(rival.returns, rival.cost).mean(axis=0) - cash
     each = [
         {**figures(row, data.dates, year), "alpha": alpha(row - cash, reference, year)}
         for row in series.returns
@@ -138,7 +140,7 @@ def _groups(
                 row("Sharpe ratio", "sharpe", "2"),
                 row("Sortino ratio", "sortino", "2"),
                 row("Calmar ratio", "calmar", "2"),
-                row(f"Alpha a year, beside {reference}", "alpha", "+%2"),
+                row(f"Alpha a year, beside {reference} before costs", "alpha", "+%2"),
                 row("Stability (R²)", "stability", "2"),
                 row("Profit factor (omega ratio)", "omega", "2"),
                 row(

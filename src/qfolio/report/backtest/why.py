@@ -154,7 +154,8 @@ def _exposures(found: Exposures | None, reference: str) -> dict[str, Any] | None
             {"name": name, "value": value, "t": number(t), "sure": abs(t) > SIGNIFICANT}
             for name, value, t in rows
         ],
-        "about": f"Returns less those of {reference}, regressed on factors made from the table. "
+        "about": f"Net returns less those of {reference} before its costs, regressed on factors "
+        "made from the table. "
         f"R² {percent(found.r2, 0)}; {found.lags} lags.",
     }
 

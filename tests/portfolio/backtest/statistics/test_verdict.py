@@ -65,7 +65,7 @@ def test_the_corrected_p_value_decides(assessment: Assessment) -> None:
     taken_away = about(growth=Contrast(0.008, (0.001, 0.034), 0.02, 0.0502, "none"))
     assert said(assessment, None, taken_away) == [
         "No evidence that dqn beats equal weight in growth, Sharpe ratio or volatility after "
-        "costs: the difference in annual growth from it is +0.8% (95% interval +0.1% to +3.4%; "
+        "costs: the difference in annual log growth from it is +0.8% (95% interval +0.1% to +3.4%; "
         "corrected p = 0.051), in Sharpe ratio 0.00 (95% interval -0.10 to +0.10; corrected "
         "p = 1.00) and in volatility 0.0% of it's (95% interval -9.5% to +10.5%; corrected "
         "p = 1.00)."
@@ -117,7 +117,7 @@ def test_claims_are_plain(assessment: Assessment) -> None:
     best = about("other", growth=better, sharpe=untested, volatility=untested)
     *_, last = said(assessment, none, none, best)
     assert last == (
-        "dqn beats other in growth after costs: the difference in annual growth from other is "
+        "dqn beats other in growth after costs: the difference in annual log growth from other is "
         "+1.0% (95% interval +0.5% to +1.5%; corrected p = 0.020)."
     )
     less = Contrast(-0.1, (-0.18, -0.02), 0.01, 0.02, "worse")
@@ -176,7 +176,7 @@ def test_an_interval_without_ends_is_said_as_such(assessment: Assessment) -> Non
     far = dataclasses.replace(nowhere, interval=(-300.0, 300.0))
     for wide in (nowhere, far):
         (sentence,) = said(assessment, None, about(growth=nowhere, sharpe=nowhere, volatility=wide))
-        assert "in annual growth from it is 0.0% (95% interval -∞% to +∞%;" in sentence
+        assert "in annual log growth from it is 0.0% (95% interval -∞% to +∞%;" in sentence
         assert "in Sharpe ratio 0.00 (95% interval -∞ to +∞;" in sentence
         assert "in volatility 0.0% of it's (95% interval -100.0% to +∞%;" in sentence
 

@@ -28,6 +28,7 @@ from qfolio.portfolio.backtest.folder import followed
 from qfolio.portfolio.backtest.folds import days_of, tested
 from qfolio.portfolio.backtest.replay import Entry, Stretch
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.statistics.measures import before_costs
 
 
 def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
@@ -54,7 +55,8 @@ def _explained(
     names_of = [fold.name for fold in backtest.folds]
     folds = dict(zip(names_of, days_of(backtest.folds), strict=True))
     year = prices.periods_per_year
-    reference = entries[config.benchmark].simulation.returns[0]
+    benchmark = entries[config.benchmark].simulation
+    reference = before_costs(benchmark.returns[0], benchmark.cost[0])
     traded = followed(name, entries)
     entry, stretches = entries[traded], backtest.stretches(name)
     net = entry.simulation.returns[0]

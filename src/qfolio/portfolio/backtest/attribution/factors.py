@@ -50,7 +50,8 @@ def exposures(
     A factor that is spanned by those before it is left out.
 
     Args:
-        active: Net returns minus those of the reference, shape (D,).
+        active: Net returns minus those of the reference before its costs, shape (D,): the costs of
+            an index that is rebalanced at every row are not the alpha of who trades less.
         factors: Returns of each factor on the same days, by its name.
         periods_per_year: For example 252 for trading days.
     """

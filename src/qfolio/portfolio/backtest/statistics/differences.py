@@ -53,12 +53,17 @@ class Contrast:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """A strategy minus a reference on the same days."""
+    """A strategy minus a reference on the same days.
+
+    among: number of strategies that the reference is the best of, seen in hindsight; the p-values
+    allow for that choice, the intervals do not.
+    """
 
     reference: str
     growth: Contrast  # of annual log growth
     sharpe: Contrast  # of annual Sharpe ratios
     volatility: Contrast  # of the log of annual volatility; less is better
+    among: int = 1
 
     def contrasts(self) -> dict[Measured, Contrast]:
         """The contrasts by measure."""
@@ -120,8 +125,9 @@ def compare(
             if name == rival.name:
                 continue
             shown = others[rival.name]
+            contrasts = {key: Contrast(e.value, e.interval()) for key, e in shown.items()}
             differences[role][name] = Difference(
-                rival.name, **{key: Contrast(e.value, e.interval()) for key, e in shown.items()}
+                rival.name, **contrasts, among=len(rival.without(name))
             )
             if name in judged:
                 for key in rival.tested:

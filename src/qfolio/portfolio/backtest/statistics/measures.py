@@ -162,6 +162,14 @@ def from_moments(
     }
 
 
+def before_costs(returns: ArrayLike, cost: ArrayLike) -> Floats:
+    """Simple returns without the costs of the trades before them, which are shares of the wealth.
+
+    Net returns stay as they are where the cost is not known (NaN).
+    """
+    return np.asarray((1 + np.asarray(returns)) / (1 - np.nan_to_num(cost)) - 1)
+
+
 def _variance(square: Floats, deviation: Floats, center: Floats) -> Floats:
     """The mean of squared deviations, exactly 0 where only rounding is left of equal returns."""
     variance = square - deviation**2

@@ -63,9 +63,12 @@ def value_at_risk(returns: ArrayLike) -> tuple[float, float]:
     """Return the historical value at risk and the expected loss beyond it (CVaR), as losses.
 
     Value at risk is the loss that a share ``TAIL`` of the returns exceed (the quantile with linear
-    interpolation); CVaR is the mean loss of the returns at or below that quantile.
+    interpolation); CVaR is the mean loss of the returns at or below that quantile. NaN for fewer
+    returns than one in ``TAIL``, which have no such tail.
     """
     values = np.asarray(returns, dtype=float)
+    if len(values) * TAIL < 1:
+        return math.nan, math.nan
     edge = np.quantile(values, TAIL)
     return float(-edge), float(-values[values <= edge].mean())
 

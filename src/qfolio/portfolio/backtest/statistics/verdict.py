@@ -169,13 +169,16 @@ def evidence(difference: Difference, assessment: Assessment) -> str:
         if comparable(key, each):
             lead = f"in {_MEASURES[key]}"
             if not texts:
-                what = "annual growth" if key == "growth" else _MEASURES[key]
+                what = "annual log growth" if key == "growth" else _MEASURES[key]
                 lead = f"the difference in {what} from {difference.reference} is"
             texts.append(f"{lead} {_numbers(key, each, p, difference.reference)}")
     if not texts:
         return ""
+    said = listed(texts)
+    if tested and difference.among > 1:
+        said += f"; p allows for the choice of the best of {difference.among}, intervals do not"
     steady = "volatility" in tested and difference.volatility.value > math.log(STEADY)
-    return listed(texts) + (f"; {difference.reference} hardly fluctuates" if steady else "")
+    return said + (f"; {difference.reference} hardly fluctuates" if steady else "")
 
 
 def comparable(key: Measured, contrast: Contrast) -> bool:
