@@ -1,14 +1,15 @@
 """The entry point; slow imports are left to the commands that need them."""
 
+import codecs
 import functools
 import io
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
-from qfolio.core.text import near, printable
+from qfolio.core.text import near, plain, printable
 from qfolio.core.version import __version__
 from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 
@@ -36,15 +37,20 @@ Examples:
   qfolio --version               show the version"""
 
 
+UNPRINTED = 3
+"""Exit code where a command did its work, and only printing failed."""
+
+
 def main() -> NoReturn:
     """Runs the program; Ctrl-C ends it at once, or after the current chunk of a training."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:  # closed, as by ">&-": no other file may get its number
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
     exit_on_ctrl_c()
+    codecs.register_error("qfolio", plain)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a file may have an encoding without "·" or "−"
+            stream.reconfigure(errors="qfolio")  # a file may have an encoding without "·" or "−"
     run()
 
 
@@ -79,17 +85,15 @@ def run() -> NoReturn:
         finally:
             sys.stdout.flush()  # here, where a broken pipe is expected
     except BrokenPipeError:  # such as: qfolio prices table.csv | head
-        _discard()
+        _discard(sys.stdout)
     except Exception as error:
+        code = UNPRINTED if _unprinted(error) else 2
         if (sentence := told(error)) is None:
             raise
-        try:
-            sys.stdout.flush()
-        except OSError:  # the output is what failed, as on a full disk
-            _discard()
-        _refuse(sentence)
+        _say(sentence)
+        sys.exit(code)
     except KeyboardInterrupt:
-        print("qfolio: interrupted", file=sys.stderr)
+        _say("interrupted")
         sys.exit(EXIT_CODE)
     sys.exit(0)
 
@@ -106,6 +110,7 @@ def _call(words: list[str]) -> None:
 
     known, name = commands(), words[0] if words else ""
     if name in known:
+        _require_usable(words)
         chosen(known[name], name, words[1:])()
         return
     if name and not name.startswith("-"):
@@ -127,6 +132,19 @@ def _call(words: list[str]) -> None:
         if completing and words[1:2] == ["bash"] and not done.code:
             _complete_files(*words[2:3])
         raise
+
+
+def _require_usable(words: list[str]) -> None:
+    """Raises QfolioError for names that are not UTF-8, and without a current folder."""
+    from qfolio.core.errors import QfolioError
+    from qfolio.core.files import require_utf8
+
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:
+        raise QfolioError("The current folder was deleted; change to another.") from None
+    for name in (here, *words):
+        require_utf8(name)
 
 
 def _prepare_completion(shell: str = "bash", script: str | None = None, *_: str) -> None:
@@ -157,11 +175,27 @@ def _named(text: str) -> Callable[[], None]:
     return command
 
 
-def _discard() -> None:
-    """Lets the rest of the output go nowhere."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _unprinted(error: Exception) -> bool:
+    """Whether standard output is what failed, as on a full disk; if so, the error names it."""
+    nameless = isinstance(error, OSError) and not error.filename
+    try:  # without a buffer, only a line more tells
+        print(end="\n" if nameless else "", flush=True)
+    except OSError:
+        _discard(sys.stdout)
+        if isinstance(error, OSError) and nameless:
+            error.filename = "standard output"
+            return True
+    return False
 
 
-def _refuse(sentence: str) -> NoReturn:
-    print(f"qfolio: {printable(sentence)}", file=sys.stderr)
-    sys.exit(2)
+def _discard(stream: TextIO) -> None:
+    """Lets the rest of a stream go nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _say(sentence: str) -> None:
+    """Writes to the standard error, if it can be written."""
+    try:
+        print(f"qfolio: {printable(sentence)}", file=sys.stderr, flush=True)
+    except OSError:
+        _discard(sys.stderr)

@@ -383,5 +383,5 @@ def test_without_gymnasium_it_says_what_to_install(monkeypatch):
     spec = importlib.util.spec_from_file_location("without_gymnasium", gym.__file__)
     assert spec is not None
     assert spec.loader is not None
-    with pytest.raises(QfolioError, match=r"pip install 'qfolio\[gym\]'"):
+    with pytest.raises(QfolioError, match=r'pip install "qfolio\[gym\]"'):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))

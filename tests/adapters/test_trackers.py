@@ -100,7 +100,7 @@ def test_a_missing_package_is_named(monkeypatch, name, module, package):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(QfolioError) as raised:
         trackers([name])
-    assert f"pip install '{package}'" in str(raised.value)
+    assert f'pip install "{package}"' in str(raised.value)
 
 
 class Failing(Tracker):

@@ -3,6 +3,9 @@
 import csv
 import json
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -570,6 +573,48 @@ def test_orders_that_cannot_be_written_are_not_recorded(copy, monkeypatch, capsy
     monkeypatch.setattr("qfolio.portfolio.desk.desk.Desk.record", lambda *_: 1 / 0)
     assert qfolio(monkeypatch, "allocate", copy, *AS_OF, *of, path) == 2
     assert not path.exists()
+
+
+FULL = Path("/dev/full")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="has no device that is always full")
+def test_what_is_recorded_although_it_cannot_be_printed_is_said(copy, tmp_path):
+    """And ends with another code than what is refused, of which nothing is recorded."""
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    path = tmp_path / "orders.csv"
+    of = [copy, *AS_OF, "--agent", "equal-weight", "--capital", 1000, "--orders", path]
+    words = [sys.executable, "-m", "qfolio", "allocate", *map(str, of)]
+
+    def run(*more):
+        with FULL.open("w") as full:
+            done = subprocess.run(
+                [*words, *more], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            )
+        return done.returncode, done.stderr
+
+    code, _ = run("--dry-run")
+    assert (code, path.exists()) == (3, False)
+    code, said = run()
+    assert code == 3
+    assert said == (
+        f"qfolio: Recorded in the ledger as {copy}/ledger/0001.json. {path} has 3 orders.\n"
+        "qfolio: standard output: No space left on device.\n"
+    )
+    code, said = run("--json")
+    assert code == 3
+    assert "already record 1 of the ledger" in said
+    assert len(records(copy)) == 1
+    assert path.read_text().count("MARKET") == 3
+
+
+def test_only_assets_that_are_not_shown_are_spoken_of(folder, monkeypatch, capsys, tmp_path):
+    holdings = tmp_path / "holdings.csv"
+    holdings.write_text("asset,shares\nA,100\n")
+    for agent, hidden in (("equal-weight", False), ("buy-and-hold", True)):
+        of = ["--holdings", holdings, "--agent", agent, "--dry-run"]
+        assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *of) == 0
+        assert ("are not shown" in capsys.readouterr().out) == hidden
 
 
 def test_nothing_to_trade_is_an_empty_file_of_orders(folder, monkeypatch, capsys, tmp_path):

@@ -74,6 +74,7 @@ def test_follow_shows_live_beside_the_backtest(folder, monkeypatch, capsys, tmp_
     assert page.count("<svg") == 2
     assert "Live returns are consistent with the backtest" in page
     assert "pathwise, live and in the backtest" in page
+    assert "Of histories like the backtest’s, 95% end between" in page
 
 
 def test_follow_reads_a_table_of_returns_as_allocate_does(folder, monkeypatch, capsys, tmp_path):
@@ -180,6 +181,21 @@ def test_the_page_does_not_replace_the_rows(folder, monkeypatch, capsys, tmp_pat
     assert qfolio(monkeypatch, "follow", folder, "--out", tmp_path / "live.html") == 2
     assert "name it *.csv" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_the_rows_replace_no_file_of_the_run_and_none_that_is_read(
+    folder, monkeypatch, capsys, tmp_path
+):
+    prices = table(tmp_path / "later.csv", 335)
+    follow, before = ["follow", folder, "--prices", prices, "--out"], prices.read_bytes()
+    assert qfolio(monkeypatch, *follow, folder / "returns.csv") == 2
+    assert (
+        "returns.csv, in the folder of the backtest, which has its own" in capsys.readouterr().err
+    )
+    assert qfolio(monkeypatch, *follow, prices) == 2
+    assert "--prices and --out name one file; give the rows their own" in capsys.readouterr().err
+    assert prices.read_bytes() == before
+    assert qfolio(monkeypatch, *follow, folder / "follow.csv") == 0  # the default
 
 
 def test_a_gain_at_every_row_is_above_the_band(folder, monkeypatch, capsys, tmp_path):

@@ -1,9 +1,11 @@
 """How commands are typed: --help, --version, --json, and what is said of wrong words."""
 
 import dataclasses
+import errno
 import inspect
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -190,6 +192,30 @@ def test_bash_completes_commands_and_options(monkeypatch, tmp_path):
 def test_a_line_break_in_a_name_is_shown_and_not_obeyed(capsys):
     console.say("", "Report: runs/a\nqfolio: all is well/report.html")
     assert capsys.readouterr().out == "\nReport: runs/a\\nqfolio: all is well/report.html\n"
+
+
+def test_a_current_folder_that_is_gone_is_told(monkeypatch, capsys):
+    def gone():
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory")
+
+    monkeypatch.setattr(os, "getcwd", gone)
+    assert typed(monkeypatch, "prices", "prices.csv") == 2
+    said = "qfolio: The current folder was deleted; change to another.\n"
+    assert capsys.readouterr().err == said
+
+
+def test_a_name_that_is_not_utf_8_is_refused_at_the_start(monkeypatch, capsys):
+    assert typed(monkeypatch, "train", "pendulum", "--out", "runs/\udcff") == 2
+    assert capsys.readouterr().err == (
+        r"qfolio: 'runs/\udcff' is not UTF-8; rename the file or the folder." "\n"
+    )
+
+
+def test_help_needs_no_docstrings():
+    asked = [sys.executable, "-OO", "-m", "qfolio", "backtest", "--help"]
+    done = subprocess.run(asked, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "--cost-bps" in done.stdout
 
 
 def test_a_pipe_folds_nothing(capsys):

@@ -32,9 +32,15 @@ def test_a_worker_has_its_own_number_of_cores(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_a=1 --xla_force_host_platform_device_count=8")
     monkeypatch.delenv("JAX_NUM_CPU_DEVICES", raising=False)
     flags = {"XLA_FLAGS": "--xla_a=1 --xla_force_host_platform_device_count=2"}
-    assert worker.environment(2) == flags
+    assert worker.environment(2) == flags | {"QFOLIO_CORES": "2"}
+    assert worker.environment(1) == flags | {"QFOLIO_CORES": "1"}  # programs of one device differ
     monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "4")
-    assert worker.environment(2) == flags | {"JAX_NUM_CPU_DEVICES": "2"}
+    assert worker.environment(3) == {
+        "XLA_FLAGS": "--xla_a=1 --xla_force_host_platform_device_count=3",
+        "JAX_NUM_CPU_DEVICES": "3",
+        "QFOLIO_CORES": "3",
+    }
+    assert worker.environment(2) == flags | {"QFOLIO_CORES": "2", "JAX_NUM_CPU_DEVICES": "2"}
 
 
 @pytest.mark.parametrize(
@@ -50,7 +56,7 @@ def test_jax_is_set_up_before_the_first_array_of_a_task(first, tmp_path):
     code = (
         f"{first}\n"
         "import jax; from qfolio.core import devices\n"
-        "assert len(jax.devices()) == len(devices.cores())\n"
+        "assert len(jax.devices()) == max(2, len(devices.cores()))\n"
         "print(jax.config.jax_default_matmul_precision, jax.config.jax_compilation_cache_dir)\n"
     )
     unset = {"XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR"}
@@ -60,6 +66,16 @@ def test_jax_is_set_up_before_the_first_array_of_a_task(first, tmp_path):
         capture_output=True, text=True,
     )  # fmt: skip
     assert done.stdout.strip() == f"highest {tmp_path / 'programs'}", done.stderr
+
+
+def test_without_a_cache_that_can_be_written_nothing_is_said():
+    code = "import qfolio, jax; qfolio.DQN(); print(jax.config.jax_compilation_cache_dir)"
+    plain = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", f"{code}; jax.numpy.ones(3).sum()"],
+        env=plain | {"QFOLIO_CACHE": f"{os.devnull}/none"}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert (done.stdout, done.stderr) == ("None\n", "")
 
 
 def test_memory_counts_every_slot(monkeypatch):

@@ -18,10 +18,12 @@ from filelock import FileLock
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import (
     cache_directory,
+    can_write,
     csv_lines,
     locked,
     naming,
     new_folder,
+    path_of,
     read_arrays,
     require_new,
     write_arrays,
@@ -134,6 +136,44 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
     assert error.value.errno == errno.EFBIG
     assert error.value.filename == str(tmp_path / "run" / "policy")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_what_a_link_leads_to_is_replaced_and_the_link_stays(tmp_path):
+    target, link = tmp_path / "sent" / "orders.csv", tmp_path / "orders.csv"
+    link.symlink_to(target)
+    for content in (b"first", b"second"):  # of a file that is not there yet, and of one that is
+        write_bytes(link, content)
+        assert (link.is_symlink(), target.read_bytes()) == (True, content)
+    assert [path.name for path in target.parent.iterdir()] == ["orders.csv"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such files")
+def test_nothing_but_a_regular_file_is_replaced(tmp_path):
+    pipe, link, loop = tmp_path / "pipe", tmp_path / "link", tmp_path / "loop"
+    os.mkfifo(pipe)
+    link.symlink_to(pipe)
+    loop.symlink_to(loop)
+    for path in (pipe, link, loop):
+        with pytest.raises(QfolioError) as raised:
+            write_bytes(path, b"")
+        assert str(raised.value) == f"{path} is no regular file; name another."
+    assert pipe.is_fifo()
+    reading, writing = os.pipe()
+    try:
+        with pytest.raises(QfolioError, match="is no regular file"):  # as /dev/stdout before a "|"
+            write_bytes(Path(f"/dev/fd/{writing}"), b"")
+    finally:
+        os.close(reading)
+        os.close(writing)
+    assert {path.name for path in tmp_path.iterdir()} == {"pipe", "link", "loop"}
+
+
+def test_a_name_that_no_page_could_hold_is_refused_before_any_work():
+    with pytest.raises(QfolioError) as raised:
+        path_of("out", os.fsdecode(b"pr\xe9.csv"))
+    assert str(raised.value) == r"'pr\udce9.csv' is not UTF-8; rename the file or the folder."
+    assert path_of("out", "prix-été").name == "prix-été"
 
 
 def test_a_folder_for_results_is_new_or_empty(tmp_path, monkeypatch):
@@ -260,3 +300,17 @@ def test_the_cache_lies_where_the_system_keeps_caches(monkeypatch):
     assert cache_directory() == Path("/somewhere")
     monkeypatch.delenv("QFOLIO_CACHE")
     assert cache_directory() == Path(platformdirs.user_cache_dir("qfolio", appauthor=False))
+
+
+def test_a_user_without_a_home_has_no_cache(monkeypatch):
+    def homeless(*_, **__):
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.delenv("QFOLIO_CACHE", raising=False)
+    monkeypatch.setattr(platformdirs, "user_cache_path", homeless)
+    place = cache_directory()
+    assert not can_write(place)
+    with pytest.raises(OSError, match=r".*"):
+        write_bytes(place / "optimum", b"")
+    with pytest.raises(QfolioError, match="cannot be read"):
+        read_arrays(place / "optimum")

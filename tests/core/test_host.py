@@ -101,6 +101,12 @@ class Narrow(Aim):
     action_space = gymnasium.spaces.Box(*np.array([[-0.4, -0.7], [0.3, 0.1]], np.float32))
 
 
+class Vast(Aim):
+    """Bounds whose range is no number in single precision."""
+
+    action_space = gymnasium.spaces.Box(-3e38, 3e38, (2,), np.float32)
+
+
 class Shares(Tiny):
     """Whole numbers of three shares, at most five."""
 
@@ -163,13 +169,15 @@ class Faulty(Tiny):
             if self.fault == "old interface":
                 return seen, reward, False, {}
             seen = {"NaN": seen * np.nan, "longer": np.ones(3), "number": 1.0}.get(self.fault, seen)
-            rewards: dict[str, Any] = {"no reward": np.nan, "rewards": np.ones(1)}
+            rewards: dict[str, Any] = {
+                "no reward": np.nan, "rewards": np.ones(1), "huge": 1e300, "none": None
+            }  # fmt: skip
             reward = rewards.get(self.fault, reward)
         return seen, reward, False, False, {}
 
 
 KINDS = (
-    Delay, Endless, Numbered, Aim, Narrow, Shares, Signed, Named, Unbounded, Unmade,
+    Delay, Endless, Numbered, Aim, Narrow, Vast, Shares, Signed, Named, Unbounded, Unmade,
     Spaceless, Faulty,
 )  # fmt: skip
 ENVIRONMENTS = {kind: f"Test{kind.__name__}-v0" for kind in KINDS}
@@ -295,9 +303,12 @@ def test_coordinates_reach_from_bound_to_bound():
     assert population.evaluate(start_keys(3)).returns.min() > -0.3  # of two steps; at first −4
 
 
-def test_rounding_does_not_lead_beyond_a_bound():
-    given = task(Narrow).facts.given(np.array([[-1, -1], [1, 1]], np.float32))
-    np.testing.assert_array_equal(given, [Narrow.action_space.low, Narrow.action_space.high])
+@pytest.mark.parametrize("kind", [Narrow, Vast])
+def test_rounding_does_not_lead_beyond_a_bound(kind):
+    given = task(kind).facts.given(np.array([[-1, -1], [1, 1], [0, 0]], np.float32))
+    low, high = kind.action_space.low, kind.action_space.high
+    np.testing.assert_array_equal(given[:2], [low, high])
+    np.testing.assert_allclose(given[2], low / 2 + high / 2, atol=1e-7)
 
 
 def test_every_graded_episode_is_that_of_its_seed():
@@ -415,6 +426,8 @@ def test_what_was_learned_outlives_an_exception_of_an_environment(monkeypatch):
             r"""FrozenLake-v1 cannot be made with kwargs={"map_name": "9x9"}: KeyError: '9x9' \(""",
         ),
         (lambda: task(Unmade), r"TestUnmade-v0 cannot be made: OSError: no license \(test_host"),
+        (lambda: task(Endless, kwargs='{"max_episode_steps": 3}'), "set horizon instead, as in"),
+        (lambda: task(Endless, kwargs='{"id": "X"}'), "kwargs sets id; the task names the envir"),
         (lambda: task(Endless, kwargs="cut=3"), "^kwargs is cut=3; it must be a JSON object"),
         (lambda: task(Endless, kwargs={"cut": 3}), "kwargs is {'cut': 3}; it must be JSON"),
         (lambda: task(Delay, horizon=-1), "horizon is -1"),
@@ -432,6 +445,8 @@ def test_it_says_what_is_wrong(make, message):
     [
         ("NaN", "step 2 of an episode: its observation is not finite"),
         ("no reward", "step 2 of an episode: its reward is not finite"),
+        ("huge", "step 2 of an episode: its reward is not finite in single precision"),
+        ("none", "step 2 of an episode: its reward is None, which is no number"),
         ("rewards", r"step 2 of an episode: its reward has the shape \(1,\); it must be one num"),
         ("starts with NaN", "the start of an episode: its observation is not finite"),
         ("longer", r"step 2 .* has the shape \(3,\) and its observation space \(2,\)"),
@@ -508,7 +523,7 @@ def test_an_agent_that_diverges_is_not_the_environments_fault():
 
 def test_without_gymnasium_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(QfolioError, match=r"pip install 'qfolio\[gym\]'"):
+    with pytest.raises(QfolioError, match=r'pip install "qfolio\[gym\]"'):
         GymnasiumTask("Unseen-v0")
 
 
@@ -516,7 +531,7 @@ def test_what_an_environment_needs_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "Box2D", None)
     for name in [name for name in sys.modules if name.startswith("gymnasium.envs.box2d")]:
         monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(QfolioError, match=r"pip install 'qfolio\[box2d\]'"):
+    with pytest.raises(QfolioError, match=r'pip install "qfolio\[box2d\]"'):
         GymnasiumTask("LunarLander-v3", kwargs='{"gravity": -9.0}')
 
 

@@ -1,5 +1,6 @@
 """Names from files, made harmless."""
 
+import codecs
 import math
 
 import pytest
@@ -12,6 +13,7 @@ from qfolio.core.text import (
     four_digits,
     listed,
     near,
+    plain,
     printable,
     quote,
 )
@@ -29,6 +31,13 @@ from qfolio.core.text import (
 )
 def test_a_terminal_obeys_nothing(text: str, shown: str | None):
     assert printable(text) == (text if shown is None else shown)
+
+
+def test_signs_outlive_an_encoding_without_them():
+    codecs.register_error("plain", plain)
+    text = "−5.0% · 2 × 3 ≥ 1 – that’s é"
+    assert text.encode("ascii", "plain") == b"-5.0% * 2 x 3 >= 1 - that's ?"
+    assert "−é".encode("latin-1", "plain") == b"-\xe9"
 
 
 def test_quotes_are_short():

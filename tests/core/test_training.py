@@ -10,6 +10,7 @@ import pytest
 from qfolio.agents.a2c import A2C
 from qfolio.agents.dqn import DQN
 from qfolio.agents.ppo import PPO
+from qfolio.agents.sac import SAC
 from qfolio.core import faults
 from qfolio.core.contract import learning_of
 from qfolio.core.devices import Members, configure
@@ -18,6 +19,7 @@ from qfolio.core.fields import number, static
 from qfolio.core.mdp import Step
 from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin, chunk_steps
+from qfolio.tasks.pendulum import Pendulum
 
 import probes
 from planted import Known
@@ -39,6 +41,23 @@ def test_a_seed_alone_equals_the_seed_among_others(task, agent):
     for seed in (0, 3):
         alone, _ = trained(task, agent, [seed], [150])
         assert_same(alone.fetch(), jax.tree.map(lambda x, s=seed: x[s : s + 1], together.fetch()))
+
+
+@pytest.mark.parametrize(
+    "agent",
+    [
+        PPO(hidden=(64, 64), num_envs=4, rollout_length=16, batch_size=32, epochs=4,
+            normalize_observations=True),
+        SAC(hidden=(64, 64), num_envs=2, learning_starts=32, batch_size=32),
+    ],
+    ids=["PPO", "SAC"],
+)  # fmt: skip
+def test_a_seed_alone_equals_the_seed_among_others_in_a_continuous_task(agent):
+    """Programs for one device and for several round this agent's losses differently."""
+    task = Pendulum()
+    together, _ = trained(task, agent, [4, 5], [256])
+    alone, _ = trained(task, agent, [5], [256])
+    assert_same(alone.fetch(), jax.tree.map(lambda x: x[1:], together.fetch()))
 
 
 def test_members_of_another_number_share_programs(task, agent):

@@ -135,7 +135,12 @@ def test_going_on_keeps_to_its_rate_wherever_the_schedule_was(final):
 
 def test_renewed_learning_knows_everything_and_remembers_nothing():
     plan = Plan(OLD, NEW, AGENT, EPISODES)
-    assert plan.renewed == dataclasses.replace(AGENT, learning_rate_steps=75.0, epsilon_start=0.3)
+    assert plan.renewed == dataclasses.replace(
+        AGENT, learning_rate_steps=75.0, importance_steps=5e4, epsilon_start=0.3
+    )
+    linear = dataclasses.replace(PLAN, agent=dataclasses.replace(AGENT, epsilon_steps=80.0)).renewed
+    assert isinstance(linear, DQN)
+    assert linear.epsilon_steps == 40
     learned, fresh = trained(OLD, AGENT).fetch(), Population(NEW, AGENT, [3, 4]).fetch()
     state = renew(AGENT, learned, fresh)
     for name in ("online", "target"):

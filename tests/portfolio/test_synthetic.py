@@ -448,10 +448,18 @@ class Unknown(Pathwise):
         return jnp.nan * super().act(state, observation, key)
 
 
+class Nowhere(Pathwise):
+    def policy(self, learned, observation):
+        return jnp.nan * super().policy(learned, observation)
+
+
 def test_weights_of_ones_own_agent_are_those_of_a_portfolio():
     task = Merton()
     with pytest.raises(QfolioError, match=r"Unscaled.policy gives weights .* that sum to 0\.9;"):
         Run.create(task, Unscaled(), episodes=8, seeds=1)
+    for each in (task, GarleanuPedersen()):  # weights, and positions
+        with pytest.raises(QfolioError, match=r"^Nowhere.policy gives an action that is not fin"):
+            faults.require_actions(each, Nowhere(rollout_length=20))
     run = Run.create(task, Drifting(num_envs=8, rollout_length=20), episodes=8, seeds=2)
     run.train()
     with pytest.raises(QfolioError, match=r"Drifting.policy gives weights .* that sum to [^1]"):

@@ -30,7 +30,7 @@ from qfolio.portfolio.rewards import Outcome
 from qfolio.portfolio.task import Portfolio
 
 with needs(
-    "gymnasium", otherwise="qfolio.adapters.gym needs Gymnasium: pip install 'qfolio[gym]'."
+    "gymnasium", otherwise='qfolio.adapters.gym needs Gymnasium: pip install "qfolio[gym]".'
 ):
     import gymnasium
     from gymnasium import spaces

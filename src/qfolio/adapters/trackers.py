@@ -93,5 +93,5 @@ def _made(name: str) -> Tracker:
 
 
 def _module(name: str, package: str) -> ModuleType:
-    with needs(name, otherwise=f"This tracker needs {name}: pip install '{package}'."):
+    with needs(name, otherwise=f'This tracker needs {name}: pip install "{package}".'):
         return import_module(name)

@@ -1,5 +1,8 @@
 """Commands of the desk: compute tomorrow's trades, and follow the ledger of past allocations."""
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -57,13 +60,14 @@ def allocate(
         agent: Agent to follow; or a baseline such as equal-weight, the benchmark or a strategy of
             your own, if the backtest has it (default: the first agent of the backtest).
         anyway: Allocate even if the backtest is not finished, or found the agent worse than the
-            benchmark, or (without a record) if the policy has learned from later prices.
+            benchmark, or if a price of the last row is doubtful, or (without a record) if the
+            policy has learned from later prices.
         whole_shares: Trade whole shares only.
         as_of: Day of the allocation; prices may be up to a week older, or more where their rows are
             farther apart than a day (default: today).
-        update: Update the policy on the new rows first, and store the new version beside the
-            earlier ones.
-        orders: Write the trades to this CSV file.
+        update: Update the policy on the new rows first, if there are any, and store the new version
+            beside the earlier ones.
+        orders: Write the trades to this CSV file, outside of the folder.
         layout: Columns of that file: generic, ib for a basket of Interactive Brokers, or alpaca or
             schwab for the fields of an order in their APIs.
         currency: Currency in that file, where the layout names one.
@@ -98,6 +102,11 @@ def allocate(
                 f"{listed([name for name, there in given.items() if there])}."
             )
         return _reproduce(desk, reproduce, prices, holdings, capital)
+
+    def warn() -> None:
+        if prices is not None:
+            print_warnings(prices.name, desk.news)
+
     try:
         made = desk.allocate(
             agent,
@@ -113,13 +122,15 @@ def allocate(
             currency=currency,
             dry_run=dry_run,
         )
-    finally:  # also if it is refused, which the prices may explain
-        if prices is not None:
-            print_warnings(prices.name, desk.news)
-    shares = not made.prices.levels
-    print_allocation(made.allocation, made.standing, made.trained, shares=shares)
-    for line in made.sentences:
-        console.tell(line)
+    except Exception:
+        warn()  # the prices may explain it
+        raise
+    with _telling("" if dry_run else made.sentences[-1]):
+        warn()
+        shares = not made.prices.levels
+        print_allocation(made.allocation, made.standing, made.trained, shares=shares)
+        for line in made.sentences:
+            console.tell(line)
     return made.to_json()
 
 
@@ -148,8 +159,8 @@ def follow(
         returns: Unit of the numbers in --prices, if they are returns (default: they are prices).
         benchmark: Latest file of the backtest's benchmark, if that is a strategy of your own
             (default: the data that the backtest read).
-        out: CSV file with a row for each row of the prices (default: follow.csv in the folder); a
-            page is written beside it, with the suffix html.
+        out: CSV file with a row for each row of the prices, outside of the folder (default:
+            follow.csv in it); a page is written beside it, with the suffix html.
         trust: Modules of your own code that the folder may name (default: none).
     """
     import numpy as np
@@ -162,18 +173,24 @@ def follow(
     from qfolio.portfolio.desk.consistency import ALARM
     from qfolio.portfolio.desk.desk import Desk
     from qfolio.portfolio.desk.follow import follow as marked
+    from qfolio.portfolio.desk.orders_csv import require_apart, require_outside
     from qfolio.report.follow import LiveRows, render_following
 
-    if out is not None and out.suffix == ".html":
+    path = folder / "follow.csv" if out is None else out
+    if path.suffix == ".html":
         raise QfolioError(
             f"--out is {out}, the CSV file; name it *.csv, and the page is written beside it."
         )
+    if path.resolve() != (folder / "follow.csv").resolve():
+        require_outside(folder, path, "--out")
+    read = {"--prices": prices, "--benchmark": benchmark, "--members": latest.members}
+    for option, source in read.items():
+        require_apart(path, option, source, by="--out", what="the rows")
     latest.require_table(prices, returns)
     desk = Desk.open(folder, returns=returns, **latest.reading)
     following = marked(desk, prices, benchmark)
     if prices is not None:
         print_warnings(prices.name, desk.news)
-    path = folder / "follow.csv" if out is None else out
     following.write(path)
     page, live = path.with_suffix(".html"), following.live
     if len(live.returns):
@@ -192,6 +209,23 @@ def follow(
     print_following(following)
     console.say(f"Rows: {path}" + (f", page: {page}" if len(live.returns) else ""))
     return following.to_json()
+
+
+@contextmanager
+def _telling(done: str) -> Iterator[None]:
+    """Says on the standard error what was done where printing fails, as on a full disk.
+
+    A reader who has gone, as in a pipe to head, is no failure. done: a sentence; empty if nothing
+    was done.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError:
+        if done:
+            print(f"qfolio: {done}", file=sys.stderr)
+        raise
 
 
 def _reproduce(

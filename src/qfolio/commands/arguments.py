@@ -3,7 +3,6 @@
 import datetime
 import re
 import secrets
-import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from tyro.conf import UseAppendAction, arg
 
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import shell
 from qfolio.experiments.budget import Budget
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def prepare(trust: Sequence[str]) -> None:
 
 def typed() -> str:
     """The command line as it was typed."""
-    return shlex.join(["qfolio", *sys.argv[1:]])
+    return shell("qfolio", *sys.argv[1:])
 
 
 def continues(*more: str) -> bool:
@@ -118,4 +118,4 @@ def training_command(
     words = ["qfolio", "train", config.task, "--agent", config.agent, "--preset", preset]
     words += [f"--{config.budget.unit}", str(config.budget.amount), *more]
     words += ["--set"] if changed else []
-    return shlex.join([*words, *(f"{k}={settings.written(v)}" for k, v in changed.items())])
+    return shell(*words, *(f"{k}={settings.written(v)}" for k, v in changed.items()))

@@ -220,7 +220,7 @@ def _options(kind: type) -> list[Option]:
     for parent in reversed(kind.__mro__):
         meanings |= _meanings(parent)
     return [
-        _option(field.name, hints[field.name], field.default, meanings[field.name])
+        _option(field.name, hints[field.name], field.default, meanings.get(field.name, ""))
         for field in dataclasses.fields(kind)
     ]
 

@@ -111,9 +111,10 @@ def _tables(sets: tuple[str, ...], load: Any) -> "dict[str, Prices]":
         if not (after and re.fullmatch(r"[\w-]+", name)):
             file = Path(entry)
             name = re.sub(r"[^\w-]+", "-", normalize("NFC", file.stem))
-        if name in files:
+        same = next((each for each in files if each.casefold() == name.casefold()), None)
+        if same is not None:  # some systems do not tell folders a and A apart
             raise QfolioError(
-                f"{files[name]} and {file} are both called {name}; name one with NAME=FILE."
+                f"{files[same]} and {file} are both called {name}; name one with NAME=FILE."
             )
         files[name] = file
     return {name: load(file) for name, file in files.items()}

@@ -144,7 +144,7 @@ def write_again(folder: Path) -> None:
 
 
 def _tuning() -> Any:
-    missing = "qfolio tune needs Optuna to choose configurations: pip install 'qfolio[tune]'."
+    missing = 'qfolio tune needs Optuna to choose configurations: pip install "qfolio[tune]".'
     with needs("optuna", otherwise=missing):
         import qfolio.experiments.tuning.run
     return qfolio.experiments.tuning.run

@@ -26,7 +26,7 @@ class Window:
 
     def __init__(self, caption: str = "qfolio") -> None:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-        missing = "The window needs Gymnasium and pygame: pip install 'qfolio[watch]'."
+        missing = 'The window needs Gymnasium and pygame: pip install "qfolio[watch]".'
         with needs("gymnasium", "pygame", otherwise=missing):
             import gymnasium
             import pygame

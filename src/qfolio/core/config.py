@@ -31,8 +31,10 @@ def require_agent_names(names: Collection[str]) -> None:
                 f"An agent is called {quote(name)}; use letters, digits, - and _, and at most one "
                 "colon within, as in tilts:low-risk."
             )
-        if (folder := agent_folder(name)) != name and folder in names:
-            raise QfolioError(f"{name} and {folder} would share a folder; rename one.")
+        folder = agent_folder(name).casefold()  # some systems do not tell a from A
+        other = next((n for n in names if n != name and agent_folder(n).casefold() == folder), None)
+        if other is not None:
+            raise QfolioError(f"{name} and {other} would share a folder; rename one.")
 
 
 class Config(msgspec.Struct, kw_only=True, frozen=True):

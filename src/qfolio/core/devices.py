@@ -23,7 +23,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import cache_directory
+from qfolio.core.files import cache_directory, can_write
 
 LOCKSTEP = {"gpu", "tpu"}
 """Platforms that step their members in lockstep."""
@@ -38,6 +38,12 @@ UNROLLED = 16
 """Most rounds of a loop that LLVM may replace by as many copies of its body. It does so before it
 looks for vector instructions, and then finds none: without this limit, an operation on a row of 20
 numbers takes longer than on one of 64, and programs take longer to compile."""
+
+FEWEST = 2
+"""Devices of a CPU, and slots of each, so that a result does not depend on their number."""
+
+CORES = "QFOLIO_CORES"
+"""Environment variable with the number of cores that a process uses, if not all that it may."""
 
 TRACING = Lock()
 """Held while a program is traced. Tracing is done in Python, where two threads slow each other. In
@@ -67,7 +73,7 @@ def configure() -> None:
         f"xla_cpu_small_while_loop_byte_threshold={SMALL_LOOP},-unroll-full-max-count={UNROLLED}"
     )
     wanted = {
-        "--xla_force_host_platform_device_count": str(len(cores())),
+        "--xla_force_host_platform_device_count": str(of_cores(len(cores()))),
         "--xla_cpu_multi_thread_eigen": "false",
         "--xla_backend_extra_options": loops,
     }
@@ -76,8 +82,10 @@ def configure() -> None:
     if not jax.config.jax_default_matmul_precision:  # type: ignore[attr-defined]
         # GPUs would round the factors to three digits. CPUs compute as before.
         jax.config.update("jax_default_matmul_precision", "highest")
-    if not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
-        jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "programs"))
+    programs = cache_directory() / "programs"
+    # Where nothing can be written, jax would warn in each run.
+    if not jax.config.jax_compilation_cache_dir and can_write(programs):  # type: ignore[attr-defined]
+        jax.config.update("jax_compilation_cache_dir", str(programs))
         # Small programs, too: compiling a dozen of them takes half a second of a command's start.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -95,6 +103,19 @@ def cores() -> list[int]:
     return sorted(os.sched_getaffinity(0)) if known else list(range(os.cpu_count() or 1))
 
 
+def of_cores(cores: int) -> int:
+    """The number of devices that stand for some cores of a CPU."""
+    return max(FEWEST, cores)
+
+
+def busy() -> int:
+    """How many devices compute at once: on a CPU, as many as this process may use cores."""
+    there = len(jax.devices())
+    if jax.devices()[0].platform in LOCKSTEP:
+        return there
+    return min(there, int(os.environ.get(CORES, len(cores()))))
+
+
 def describe() -> str:
     """The number, kind and platform of the devices.
 
@@ -109,7 +130,7 @@ def describe() -> str:
             f"jax finds no device of JAX_PLATFORMS={platforms}; unset it, or install jax for this "
             "platform."
         ) from None
-    return f"{len(devices)} × {devices[0].device_kind} ({devices[0].platform})"
+    return f"{busy()} × {devices[0].device_kind} ({devices[0].platform})"
 
 
 def circumstances(*programs: str) -> dict[str, Any]:
@@ -161,14 +182,17 @@ class Members:
 
     def __init__(self, count: int, room: int = 0) -> None:
         self.room = max(count, room)
-        devices = jax.devices()[: min(len(jax.devices()), self.room)]
-        self.one_by_one = devices[0].platform not in LOCKSTEP
-        self.form = (self.room, len(devices), self.one_by_one)
-        # At least two slots if members take turns: XLA drops an axis of length one and then rounds
-        # differently. An empty slot costs memory, but no time.
-        slots = max(2 if self.one_by_one else 1, -(-self.room // len(devices)))
+        self.one_by_one = jax.devices()[0].platform not in LOCKSTEP
+        # At least two devices, and two slots on each, if members take turns: XLA neither divides a
+        # program for one device nor keeps an axis of length one, and then rounds differently. An
+        # empty slot costs memory, but no time.
+        least = FEWEST if self.one_by_one else 1
+        devices = jax.devices()[: max(least, self.room)]
+        used = min(busy(), len(devices))
+        slots = max(least, -(-self.room // used))
         self.slots = slots * len(devices)
-        shares = np.array_split(np.arange(count), len(devices))
+        self.form = (slots, len(devices), self.one_by_one)
+        shares = [*np.array_split(np.arange(count), used), *[np.arange(0)] * (len(devices) - used)]
         self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
         self._filling = np.concatenate([np.resize(share, slots) for share in shares])
         self._sharding = NamedSharding(

@@ -14,8 +14,8 @@ from typing import Any
 from qfolio.core.text import listed
 
 OUT_OF_MEMORY = (
-    "There is too little memory for these settings; lower the number of seeds, num_envs, or "
-    "whichever of batch_size and hidden the agent has."
+    "There is too little memory; free some, or ask for less: a smaller table, fewer seeds, or a "
+    "lower num_envs, batch_size or hidden."
 )
 
 

@@ -122,30 +122,37 @@ def _told(task: Task, agent: Agent, checked: Checked) -> str | None:
 def require_actions(task: Task, agent: Agent, learned: PyTree | None = None) -> None:
     """Raises QfolioError if a user's own agent chooses what the task does not have.
 
-    These are weights that nobody can hold, or numbers of no choice, at the start of an episode.
+    These are weights that nobody can hold, numbers of no choice, or numbers that are not finite, at
+    the start of an episode.
 
     learned: what members have learned, with a leading member axis (default: an untrained agent).
     """
     if not (task.compiled and own_modules(agent)):
         return
 
-    def chosen(key: PRNGKeyArray) -> dict[str, Array]:
+    def chosen(key: PRNGKeyArray) -> tuple[Bool[Array, ""], dict[str, Array]]:
         agent_key, reset_key, act_key = jax.random.split(key, 3)
         starts = jax.vmap(task.reset)(jax.random.split(reset_key, agent.num_envs))
         seen = jax.vmap(task.observe)(starts)
+        finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(seen)]).all()
         if learned is not None:
-            return {"policy": jax.vmap(agent.policy, in_axes=(0, None))(learned, seen)}
+            return finite, {"policy": jax.vmap(agent.policy, in_axes=(0, None))(learned, seen)}
         state = agent.init(task, agent_key)
         acts = agent.act(state, seen, act_key)
-        return {"act": acts, "policy": agent.policy(agent.weights(state), seen)}
+        return finite, {"act": acts, "policy": agent.policy(agent.weights(state), seen)}
 
-    for method, actions in jax.jit(chosen)(jax.random.key(0)).items():
+    finite, found = jax.jit(chosen)(jax.random.key(0))
+    if not finite:  # which ``find`` tells of the task
+        return
+    for method, actions in found.items():
         if said := _refused(task.actions, np.asarray(actions)):
             raise QfolioError(f"{type(agent).__name__}.{method} gives {said}")
 
 
 def _refused(actions: Any, given: np.ndarray) -> str:
     """Why a task does not have the actions given; empty if it has them."""
+    if not np.isfinite(given).all():
+        return "an action that is not finite."
     if isinstance(actions, Discrete):
         wrong = given[(given < 0) | (given >= actions.n)]
         return (

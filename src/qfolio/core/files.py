@@ -21,7 +21,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from qfolio.core.errors import QfolioError, require_type
-from qfolio.core.text import csv_cell, shell
+from qfolio.core.text import csv_cell, quote, shell
 
 _JSON = msgspec.json.Encoder()
 _NUMBERS, _LARGE = (float, int), 2.0**63  # msgspec takes no larger integers
@@ -38,31 +38,60 @@ def cache_directory() -> Path:
     """
     if path := os.environ.get("QFOLIO_CACHE"):
         return Path(path)
-    return platformdirs.user_cache_path("qfolio", appauthor=False)
+    try:
+        return platformdirs.user_cache_path("qfolio", appauthor=False)
+    except RuntimeError:  # no home; other users might write to a folder for temporary files
+        return Path(os.devnull) / "qfolio"  # where nothing can be written
+
+
+def can_write(folder: Path) -> bool:
+    """Whether a folder, or else the nearest one above it that exists, lets files be made in it."""
+    there = _nearest(folder)
+    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+
+
+def _nearest(folder: Path) -> Path:
+    """The folder itself, or the nearest one above it that exists."""
+    return next((place for place in (folder, *folder.parents) if os.path.exists(place)), Path())
 
 
 def path_of(name: str, value: Path | str) -> Path:
     """The path that an argument is; raises QfolioError for anything else."""
     require_type(name, value, (str, os.PathLike), 'a path, such as "runs/mine"')
+    require_utf8(value)
     return Path(value)
+
+
+def require_utf8(name: Path | str) -> None:
+    """Raises QfolioError for a name that no page and no table of results could hold."""
+    try:
+        str(name).encode()
+    except UnicodeEncodeError:
+        raise QfolioError(
+            f"{quote(name, 300)} is not UTF-8; rename the file or the folder."
+        ) from None
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Writes to a temporary name beside ``path``, then renames: a reader sees all or nothing.
 
-    Raises QfolioError if the path is a folder.
+    A link stays, and what it leads to is replaced. Raises QfolioError if the path is a folder or,
+    like a pipe or a device, no regular file.
     """
-    if path.is_dir():
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
         raise QfolioError(f"{path} is a folder; name a file.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
+    if (path.exists() or target.is_symlink()) and not path.is_file():  # a link in a loop, too
+        raise QfolioError(f"{path} is no regular file; name another.")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}{UNFINISHED}")
     try:
         with naming(path):
             with temporary.open("wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-            temporary.replace(path)
+            temporary.replace(target)
     except BaseException:
         with contextlib.suppress(OSError):  # on a disk that has become read-only
             temporary.unlink(missing_ok=True)
@@ -95,12 +124,9 @@ def require_new(folder: Path, option: str | None = "--resume") -> None:
         raise QfolioError(
             f"{folder} is a link or a mount point, which no folder can replace; name a new folder."
         )
-    there = next((place for place in folder.parents if os.path.exists(place)), Path())
-    if not os.access(there, os.W_OK | os.X_OK):
-        how = " with --out" if option else ""
-        raise QfolioError(
-            f"Nothing can be written to {there.resolve()}; name a folder elsewhere{how}."
-        )
+    if not can_write(folder.parent):
+        there, how = _nearest(folder.parent).resolve(), " with --out" if option else ""
+        raise QfolioError(f"Nothing can be written to {there}; name a folder elsewhere{how}.")
 
 
 def require_there(folder: Path) -> None:

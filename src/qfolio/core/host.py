@@ -39,6 +39,9 @@ T = TypeVar("T")
 CHUNK = 200
 """Least number of steps in a chunk (rounded up to whole rollouts)."""
 
+LARGEST = float(np.finfo(np.float32).max)
+"""The largest number in single precision, in which agents learn."""
+
 LANES = 10
 """Environments that are stepped side by side when a member is evaluated."""
 
@@ -123,7 +126,7 @@ class Environments:
     def step(self, actions: np.ndarray, which: Iterable[int] | None = None) -> Outcome:
         """Steps all environments, or only those in ``which``; resets none."""
         count = len(self._steppers)
-        reward = np.zeros(count, np.float32)
+        reward = np.zeros(count)
         terminated, truncated = np.zeros(count, bool), np.zeros(count, bool)
         after = np.zeros_like(self.observation)
         given = self._facts.given(actions)
@@ -137,10 +140,8 @@ class Environments:
                         "terminated, truncated and info"
                     )
                 observation, paid, terminated[i], truncated[i], _ = result
-                if not isinstance(paid, float) and np.shape(paid):
-                    raise QfolioError(
-                        f"its reward has the shape {np.shape(paid)}; it must be one number"
-                    )
+                if not isinstance(paid, float):
+                    _require_number(paid)
                 reward[i] = paid
                 after[i] = self._seen(observation)
             except Exception as error:
@@ -148,7 +149,7 @@ class Environments:
         self._require_finite(after, reward)
         self.observation = after
         truncated = (truncated | (self._steps >= self._limit)) & ~terminated
-        return Outcome(reward, after, terminated, truncated)
+        return Outcome(reward.astype(np.float32), after, terminated, truncated)
 
     def restart(self, finished: Bool[np.ndarray, " environment"]) -> None:
         """Resets the finished environments; arrays returned before stay unchanged."""
@@ -167,13 +168,14 @@ class Environments:
         return seen
 
     def _require_finite(self, after: np.ndarray, reward: np.ndarray) -> None:
-        """Raises QfolioError if an environment returned a number that is not finite."""
-        if np.isfinite(after).all() and np.isfinite(reward).all():
+        """Raises QfolioError if an environment returned a number that is not finite in float32."""
+        paid = np.abs(reward) <= LARGEST  # False for NaN
+        if np.isfinite(after).all() and paid.all():
             return
         for i in range(len(reward)):
-            for what, value in (("observation", after[i]), ("reward", reward[i])):
-                if not np.isfinite(value).all():
-                    raise self._failure(i, f"its {what} is not finite")
+            for what, fine in (("observation", np.isfinite(after[i]).all()), ("reward", paid[i])):
+                if not fine:
+                    raise self._failure(i, f"its {what} is not finite in single precision")
 
     def _failure(self, index: int, reason: str | Exception) -> QfolioError:
         if isinstance(reason, QfolioError):
@@ -183,6 +185,14 @@ class Environments:
         step = int(self._steps[index])
         where = f"at step {step} of an episode" if step else "at the start of an episode"
         return QfolioError(f"{self._name} failed {where}: {reason}.")
+
+
+def _require_number(paid: Any) -> None:
+    """Raises QfolioError for a reward that numpy would take for NaN, or for a row of numbers."""
+    if paid is None:
+        raise QfolioError("its reward is None, which is no number")
+    if np.shape(paid):
+        raise QfolioError(f"its reward has the shape {np.shape(paid)}; it must be one number")
 
 
 def _close(environments: Iterable[Any]) -> None:

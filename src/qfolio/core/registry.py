@@ -10,7 +10,6 @@ from someone else: they must be in modules that have already been imported (``im
 
 import dataclasses
 import os
-import shlex
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import import_module
@@ -23,7 +22,7 @@ from typing import Any, Literal, NamedTuple
 
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError, one_line, require_methods
-from qfolio.core.text import closest
+from qfolio.core.text import closest, shell
 
 TASKS = {
     "pendulum": "qfolio.tasks.pendulum:Pendulum",
@@ -261,7 +260,7 @@ def again(command: str, folder: Path, *parts: object, on: str = "here") -> str:
     """
     modules = own_modules(*parts)
     words = [*command.split(), str(folder), *(["--trust", *modules] if modules else [])]
-    return shlex.join([*words, *(["--on", on] if on != "here" else [])])
+    return shell(*words, *(["--on", on] if on != "here" else []))
 
 
 def trust(modules: Iterable[str]) -> None:

@@ -2,8 +2,10 @@
 
 import difflib
 import math
+import os
 import re
 import shlex
+import subprocess
 import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,6 +18,12 @@ reverse text), unassigned, private, surrogates, line and paragraph separators.""
 MENTIONED = 20
 """Most names that a message lists."""
 
+PLAIN = {
+    "\N{MINUS SIGN}": "-", "–": "-", "·": "*", "×": "x", "…": "...", "’": "'", "“": '"', "”": '"',
+    "≤": "<=", "≥": ">=", "±": "+-", "∞": "inf", "─": "-", "│": "|",
+}  # fmt: skip
+"""What stands for a character in an encoding without it, such as ASCII; "?" for all others."""
+
 _FORMULA = re.compile(r"(^|[;\t\r\n])([^\S\t\r\n]*[=+\-@＝＋－＠])")
 
 
@@ -26,15 +34,24 @@ def printable(text: str) -> str:
     return "".join(ascii(c)[1:-1] if unicodedata.category(c) in UNSAFE else c for c in text)
 
 
+def plain(error: UnicodeError) -> tuple[str, int]:
+    """A handler of encoding errors (``codecs.register_error``) that keeps signs: see ``PLAIN``."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    lacking = error.object[error.start : error.end]
+    return "".join(PLAIN.get(c, "?") for c in lacking), error.end
+
+
 def quote(value: object, limit: int = 60) -> str:
     """Any value in quotation marks, on one line and cut to ``limit`` characters."""
     text = str(value)
     return f"'{printable(text if len(text) <= limit else text[: limit - 1] + '…')}'"
 
 
-def shell(path: Path) -> str:
-    """A path as a shell takes it, for commands that can be pasted."""
-    return shlex.quote(str(path))
+def shell(*words: Path | str) -> str:
+    """Words as the system's shell takes them, for commands that can be pasted."""
+    join = subprocess.list2cmdline if os.name == "nt" else shlex.join
+    return join(map(str, words))
 
 
 def amount(count: int, noun: str) -> str:

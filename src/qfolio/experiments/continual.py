@@ -106,8 +106,9 @@ class Plan:
     @property
     def renewed(self) -> Agent:
         """The agent, with shorter schedules and less exploration."""
-        steps = self.renewal * _setting(self.agent, "steps")
-        agent = self._set(learning_rate_steps=steps)
+        schedules = ("learning_rate_steps", "epsilon_steps", "importance_steps")
+        own = [name for name in schedules if hasattr(self.agent, name)]
+        agent = self._set(**{name: self.renewal * getattr(self.agent, name) for name in own})
         if isinstance(epsilon := getattr(agent, "epsilon_start", None), float):
             agent = dataclasses.replace(agent, epsilon_start=min(epsilon, self.epsilon))
         return agent

@@ -41,6 +41,9 @@ UPDATE_RATE = 0.1
 MOST = 100.0
 """Largest weight that may be held, long or short, where debts are allowed."""
 
+ROUNDING = 1e-6
+"""A weight this little below zero is zero, since policies decide in float32."""
+
 UNKNOWN = np.datetime64("NaT", "s")
 
 
@@ -152,8 +155,9 @@ class Policy:
         table = self.table(prices, **options)
         held, last = self.holdings(holdings), len(table) - 1
         held = held if table.listed is None else cashed(held, table.listed[-1])
-        targets, _ = self.decide(table, last, held, 1, spent=spent, whole=True)
-        return dict(zip(("cash", *self.assets), targets[0].tolist(), strict=True))
+        (targets,), _ = self.decide(table, last, held, 1, spent=spent, whole=True)
+        weights = np.where((targets < 0) & (targets > -ROUNDING), 0.0, targets)
+        return dict(zip(("cash", *self.assets), (weights / weights.sum()).tolist(), strict=True))
 
     def update(
         self,

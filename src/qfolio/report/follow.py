@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from qfolio.report import palette
+from qfolio.report.comparison import tidy
 from qfolio.report.figures.style import NARROW, legend_above, new_figure, svgs
 from qfolio.report.rendering import number, percent, render
 
@@ -56,7 +57,8 @@ def render_following(
         for name, found in measures.items()
     ]
     chart = svgs(draw_following, rows, WIDTH)
-    return render("follow.html", title=title, sentences=sentences, table=table, chart=chart)
+    said = [*map(tidy, sentences)]
+    return render("follow.html", title=title, sentences=said, table=table, chart=chart)
 
 
 def draw_following(rows: LiveRows, width: float) -> Figure:

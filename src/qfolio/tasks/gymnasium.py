@@ -23,6 +23,12 @@ from qfolio.core.text import near
 UNLIMITED = 1000
 """Steps after which an episode is truncated if the environment itself has no time limit."""
 
+_ELSEWHERE = {
+    "id": "the task names the environment, as in gym:CartPole-v1",
+    "max_episode_steps": "set horizon instead, as in --set horizon=500",
+}
+"""Arguments of ``gymnasium.make`` that are set elsewhere."""
+
 
 class GymnasiumTask(HostTask):
     """An environment by its ID in Gymnasium's registry, such as ``CartPole-v1``.
@@ -108,8 +114,9 @@ class Facts(NamedTuple):
         share = (np.clip(np.nan_to_num(actions), -1.0, 1.0) + 1) / 2
         whole = np.issubdtype(self.low.dtype, np.integer)
         low, high = (x.astype(float) if whole else x for x in (self.low, self.high))
-        # Rounding may lead beyond a bound.
-        made = np.clip(low + share.reshape(-1, *low.shape) * (high - low), low, high)
+        share = share.reshape(-1, *low.shape)
+        # Not low + share * (high - low): the range may overflow. Rounding may lead beyond a bound.
+        made = np.clip(low * (1 - share) + high * share, low, high)
         return list(np.rint(made).astype(self.low.dtype) if whole else made)
 
     def seen(self, observation: Any) -> Any:
@@ -185,7 +192,7 @@ def _make(id: str, kwargs: str, **options: Any) -> Any:
     try:
         return _gymnasium().make(spec, max_episode_steps=-1, **arguments, **options)
     except (error.DependencyNotInstalled, ImportError) as reason:
-        box2d = "pip install 'qfolio[box2d]'." if "ox2" in str(reason) else _sentence(reason)
+        box2d = 'pip install "qfolio[box2d]".' if "ox2" in str(reason) else _sentence(reason)
         raise QfolioError(f"{id} needs more than Gymnasium: {box2d}") from None
     except TypeError as reason:
         raise QfolioError(f"{id} cannot be made with kwargs={kwargs} ({reason}).") from None
@@ -214,10 +221,13 @@ def _spec(id: str) -> Any:
 def _arguments(kwargs: str) -> dict[str, Any]:
     try:
         arguments = json.loads(kwargs or "{}")
-        if isinstance(arguments, dict):
-            return arguments
     except ValueError:
-        pass
+        arguments = None
+    if isinstance(arguments, dict):
+        for name, instead in _ELSEWHERE.items():
+            if name in arguments:
+                raise QfolioError(f"kwargs sets {name}; {instead}.")
+        return arguments
     raise QfolioError(
         f"kwargs is {kwargs}; it must be a JSON object, for example "
         """'kwargs={"continuous": true}'."""
@@ -229,6 +239,6 @@ def _sentence(reason: Exception) -> str:
 
 
 def _gymnasium() -> Any:
-    with needs("gymnasium", otherwise="gym: needs Gymnasium: pip install 'qfolio[gym]'."):
+    with needs("gymnasium", otherwise='gym: needs Gymnasium: pip install "qfolio[gym]".'):
         import gymnasium
     return gymnasium

@@ -1,7 +1,11 @@
 """Which prices a desk reads, and what its allocations write."""
 
+import contextlib
 import datetime
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +17,11 @@ from leaning import Leaning
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk
+from qfolio.portfolio.desk.doubts import require_plausible
 from qfolio.portfolio.desk.ledger import Ledger
 from qfolio.portfolio.prices.table import load
 
-from tables import days, random_walk, write_table
+from tables import days, price_table, random_walk, write_table
 from tiny import PATHWISE
 
 
@@ -97,6 +102,73 @@ def test_orders_do_not_replace_an_input(finished, tmp_path, argument, kind):
         Desk.open(finished).allocate(**of, as_of="2020-09-16", anyway=True, dry_run=True)
 
 
+def test_orders_do_not_replace_what_the_run_has(finished, tmp_path):
+    """Nor do they through a link."""
+    folder, linked = shutil.copytree(finished, tmp_path / "run"), tmp_path / "orders.csv"
+    linked.symlink_to(folder / "config.json")
+    before = every_file(folder)
+    for place in (folder / "config.json", folder / "new" / "orders.csv", linked):
+        with pytest.raises(QfolioError, match=r"--orders is .*, in the folder of the backtest"):
+            Desk.open(folder).allocate(orders=place, as_of="2020-09-16", anyway=True, capital=1.0)
+    assert every_file(folder) == before
+
+
+def test_orders_go_where_a_link_leads_and_to_no_device(finished, tmp_path):
+    folder, orders = shutil.copytree(finished, tmp_path / "run"), tmp_path / "orders.csv"
+    orders.symlink_to(tmp_path / "outbox.csv")
+    of: dict[str, Any] = {"as_of": "2020-09-16", "anyway": True, "capital": 1000.0}
+    Desk.open(folder).allocate(orders=orders, **of)
+    assert orders.is_symlink()
+    assert (tmp_path / "outbox.csv").read_text().count("MARKET") == 3
+    for place in (tmp_path, Path("/dev/null")):
+        with pytest.raises(QfolioError, match="is no regular file; name another for the orders"):
+            Desk.open(folder).allocate(orders=place, **of)
+
+
+def doubtful_table(path, change):
+    """Newer prices, of which the last row's B is multiplied."""
+    head, *rows = write_table(path, rows=270).read_text().split()
+    a, b, *rest = rows[-1].split(",")
+    last = ",".join([a, b, str(change * float(rest[0])), rest[1]])
+    path.write_text("\n".join([head, *rows[:-1], last]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [(0.1, "a split that was not adjusted"), (0.45, "a wrong price")],
+    ids=["a cut number", "a crash"],
+)
+def test_a_doubtful_price_is_traded_on_demand_only(finished, tmp_path, change, said):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    of: dict[str, Any] = {
+        "agent": "equal-weight", "prices": doubtful_table(tmp_path / "newer.csv", change),
+        "capital": 1000.0, "as_of": "2020-09-26",
+    }  # fmt: skip
+    found = rf"On 2020-09-26, the price of 'B' is .* the one before, .*: perhaps {said}; correct"
+    with pytest.raises(QfolioError, match=found):
+        Desk.open(folder).allocate(**of)
+    assert numbers(folder) == []
+    assert Desk.open(folder).allocate(**of, anyway=True).record is not None
+    assert numbers(folder) == [1]
+
+
+def test_several_doubtful_prices_are_counted_and_earlier_ones_are_no_reason():
+    values = random_walk(270, assets=6)
+    earlier = values.copy()
+    earlier[200:, 1] *= 0.3
+    require_plausible(price_table(earlier))
+    values[-1, 1:3] *= [0.3, 0.1]
+    with pytest.raises(QfolioError, match="and there is 1 more such move; correct the prices or"):
+        require_plausible(price_table(values))
+
+
+def test_a_haircut_is_no_doubtful_price():
+    values, listed = random_walk(270), np.ones((270, 3), bool)
+    values[-1, 1], listed[-1, 1] = 0.3 * values[-2, 1], False
+    require_plausible(price_table(values, listed=listed))
+
+
 def fails(*_, **__):
     raise ZeroDivisionError
 
@@ -110,6 +182,10 @@ def fails_for_orders(replace):
     return renamed
 
 
+def numbers(folder):
+    return [record.number for record in Ledger(folder / "ledger").records()]
+
+
 @pytest.mark.parametrize("update", [False, True])
 @pytest.mark.parametrize("earlier", [False, True])
 @pytest.mark.parametrize(
@@ -117,15 +193,15 @@ def fails_for_orders(replace):
     [(Ledger, "append", fails), (Path, "replace", fails_for_orders(Path.replace))],
     ids=["the record", "the orders"],
 )
-def test_what_fails_leaves_everything_as_it_was(
+def test_what_fails_leaves_no_record_and_the_earlier_orders(
     finished, tmp_path, monkeypatch, kind, step, broken, earlier, update
 ):
-    """An earlier file of orders, too, and no policy that has learned from the new rows."""
+    """A policy may have been updated; the next try follows it."""
     folder = shutil.copytree(finished, tmp_path / "run")
     newer, orders = write_table(tmp_path / "newer.csv", rows=270), tmp_path / "orders.csv"
     if earlier:
         orders.write_text("orders of another day")
-    before = every_file(tmp_path)
+    before = sorted(tmp_path.iterdir())
     of: dict[str, Any] = {"prices": newer, "capital": 1000.0, "as_of": "2020-09-26"}
 
     def allocate():
@@ -135,28 +211,100 @@ def test_what_fails_leaves_everything_as_it_was(
         patched.setattr(kind, step, broken)
         with pytest.raises(ZeroDivisionError):
             allocate()
-    assert every_file(tmp_path) == before
+    assert numbers(folder) == []
+    assert sorted(tmp_path.iterdir()) == before
+    assert not earlier or orders.read_text() == "orders of another day"
     made = allocate()  # and the next try succeeds
     assert made.record is not None
     assert made.record.policy == ("latest-1" if update else "latest")
     assert orders.read_text().count("MARKET") == 3
 
 
-def test_an_allocation_that_fails_removes_its_own_policy_alone(finished, tmp_path, monkeypatch):
-    """Meanwhile, another process may have updated the policy once more."""
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from qfolio.portfolio.desk.desk import Desk
+from qfolio.portfolio.desk.doubts import require_plausible
+
+folder, prices, orders, victim = sys.argv[1:]
+replace = Path.replace
+
+def killed(path, target):
+    if Path(target).name == victim:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return replace(path, target)
+
+Path.replace = killed
+Desk.open(folder).allocate(
+    prices=prices, capital=1000.0, as_of="2020-09-26", anyway=True, update=True, orders=orders
+)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="as POSIX kills")
+@pytest.mark.parametrize(
+    ("victim", "before"),
+    [("latest-1.safetensors", []), ("0001.json", []), ("orders.csv", [1])],
+)
+def test_a_kill_leaves_no_new_orders_without_a_record(finished, tmp_path, victim, before):
+    """And the same allocation again, with its update, finishes what was begun."""
     folder = shutil.copytree(finished, tmp_path / "run")
-    own, other = (folder / "policies/pathwise" / f"latest-{n}.safetensors" for n in (1, 2))
-
-    def append(*_, **__):
-        shutil.copy(own, other)
-        fails()
-
-    monkeypatch.setattr(Ledger, "append", append)
-    newer = write_table(tmp_path / "newer.csv", rows=270)
+    newer, orders = write_table(tmp_path / "newer.csv", rows=270), tmp_path / "orders.csv"
+    orders.write_text("orders of another day")
+    words = [sys.executable, "-c", KILLED, folder, newer, orders, victim]
+    assert subprocess.run(words, check=False).returncode == -signal.SIGKILL
+    assert orders.read_text() == "orders of another day"
+    assert numbers(folder) == before
     of: dict[str, Any] = {"prices": newer, "capital": 1000.0, "as_of": "2020-09-26"}
-    with pytest.raises(ZeroDivisionError):
-        Desk.open(folder).allocate(**of, anyway=True, update=True)
-    assert (own.exists(), other.exists()) == (False, True)
+    for _ in range(2):
+        made = Desk.open(folder).allocate(**of, anyway=True, update=True, orders=orders)
+        assert orders.read_text().count("MARKET") == 3
+    assert numbers(folder) == [1]
+    assert made.record is not None
+    assert made.record.policy == "latest-1"
+    assert "The policy has already learned from the prices up to 2020-09-26, and" in " ".join(
+        made.sentences
+    )
+    assert made.sentences[-1].startswith("This allocation is already record 1 of the ledger.")
+
+
+@pytest.mark.parametrize("update", [False, True])
+def test_of_two_at_once_the_loser_leaves_the_winners_orders(
+    finished, tmp_path, monkeypatch, update
+):
+    """The winner comes between the loser's decision and its record; it may hold the lock still."""
+    folder = shutil.copytree(finished, tmp_path / "run")
+    newer, orders = write_table(tmp_path / "newer.csv", rows=270), tmp_path / "orders.csv"
+    of: dict[str, Any] = {
+        "prices": newer, "as_of": "2020-09-26", "anyway": True, "update": update, "orders": orders
+    }  # fmt: skip
+    locked, winners = Ledger.locked, []
+
+    @contextlib.contextmanager
+    def overtaken(ledger):
+        monkeypatch.setattr(Ledger, "locked", locked)
+        Desk.open(folder).allocate(capital=2000.0, **of)
+        winners.append(orders.read_bytes())
+        with contextlib.nullcontext() if update else locked(ledger), locked(ledger):
+            yield
+
+    monkeypatch.setattr(Ledger, "locked", overtaken)
+    said = "has updated pathwise meanwhile; allocate again" if update else "is in use by process"
+    with pytest.raises(QfolioError, match=said):
+        Desk.open(folder).allocate(capital=1000.0, **of)
+    (record,) = Ledger(folder / "ledger").records()
+    assert record.cash == 2000
+    assert [orders.read_bytes()] == winners
+    assert Desk.open(folder).reproduce("2020-09-26")[0] == record
+
+
+def test_a_policy_gives_no_weight_that_only_rounding_puts_below_zero(finished, monkeypatch):
+    policy = Backtest.open(finished).policy()
+    decided = np.array([[-1.2e-7, 0.5, 0.3, 0.2 + 1.2e-7]])
+    monkeypatch.setattr(policy, "decide", lambda *_, **__: (decided, decided))
+    weights = policy.weights(Backtest.open(finished).prices)
+    assert f"{weights['cash']:.4f}" == "0.0000"
+    assert sum(weights.values()) == pytest.approx(1, abs=1e-12)
 
 
 def test_an_agent_that_the_folder_cannot_restore_is_given(tmp_path):

@@ -77,11 +77,11 @@ def test_orders_in_shares_count_at_the_prices_of_their_day(desk):
 
 def test_an_asset_as_benchmark_gets_everything(desk):
     assert ordered(desk, "C", 160) == [0, 0, 0, 1]
-    (dated, broken) = desk.followed("C").notes(table())
-    assert dated == "These are the weights of C of 2020-01-01, its latest up to 2020-06-08."
+    (held, broken) = desk.followed("C").notes(table())
+    assert held == "C is bought with all the money, and held."
     assert broken == (
-        "They break the mandate (a weight is above its cap by 0.45), and are carried out all the "
-        "same, as in the backtest."
+        "The weights break the mandate (a weight is above its cap by 0.45), and are carried out "
+        "all the same, as in the backtest."
     )
     assert desk.followed("60/40").notes(table()) == [
         "These are the weights of 60/40 of 2020-05-10, its latest up to 2020-06-08 in the "
@@ -107,14 +107,14 @@ def test_an_order_that_trades_too_much_or_too_little_is_named(tmp_path):
 
     assert said([0.4, 0.5, 0.1, 0.0], spent=0.5) == ""
     assert said([1.0, 0.0, 0.0, 0.0]) == (
-        "They break the mandate (turnover is too high by 0.1, turnover of the year is too high by "
-        "0.1"
+        "The weights break the mandate (turnover is too high by 0.1, turnover of the year is too "
+        "high by 0.1"
     )
     assert said([0.6, 0.3, 0.1, 0.0], spent=0.4) == (
-        "They break the mandate (turnover of the year is too high by 0.1"
+        "The weights break the mandate (turnover of the year is too high by 0.1"
     )
     assert said([0.396, 0.504, 0.1, 0.0]) == (
-        "They break the mandate (a trade is too small by 0.006"
+        "The weights break the mandate (a trade is too small by 0.006"
     )
 
 

@@ -83,6 +83,7 @@ def test_single_keys_take_precedence_over_a_file():
         "trading.turnover": "--limits has 'trading.turnover'; it must be a key and a value",
         "trading turnover=1": "it must be a key and a value",
         "trading.turnover=much": "--limits: trading.turnover is 'much'; it must be a number",
+        "assets.forbidden=A": r"""it must be a list, such as 'assets.forbidden=\["USO"\]'""",
         "assets.floor.A=0.1": "sets assets.floor.A, but the mandate has a floor of 0.05 for all",
     }.items():
         with pytest.raises(QfolioError, match=message):
@@ -135,6 +136,7 @@ def test_its_text_is_whole_and_is_for_any_order_of_assets(tmp_path):
         ("[groups.a]\nb = {cap = 1}\nc = {cap = 'x'}", "groups.a.c.cap is 'x'; .* a number"),
         ("[assets]\ncap = 20", "assets.cap is 20; it must be at most 3"),
         ("[trading]\nholdings = 2.5", "trading.holdings is 2.5; it must be a whole number"),
+        ("[assets]\nforbidden = 'SPY'", 'it must be a list, such as \\["USO"\\]'),
         ("[cash", "is not valid TOML"),
         ("[assets]\nforbidden = ['SPX']", "'SPX', which is no asset of.* mean SPY"),
         ("[assets.cap]\nQQQ = 0.1", "assets.cap of the mandate names 'QQQ'.*choose from SPY"),

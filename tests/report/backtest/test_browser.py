@@ -13,7 +13,7 @@ from qfolio.report.backtest.opening import lead_name
 from qfolio.report.backtest.page import render_backtest
 from qfolio.report.printing import find_browser, print_pdf
 
-from backtests import ATTACK, make_data, usual
+from backtests import ATTACK, Page, make_data, usual
 from browser import Browser
 
 DRAWN = "location.protocol === 'file:' && document.querySelectorAll('.chart .main-svg').length >= 3"
@@ -244,6 +244,19 @@ def test_the_rolling_chart_is_followed_after_printing(browser: Browser, tmp_path
     browser.wait(f"{heard} === 1")
 
 
+def test_rolling_lines_begin_at_the_axis(browser: Browser, tmp_path: Path) -> None:
+    """An axis from the first day would leave the first year empty."""
+    page = render_backtest(usual(400))
+    (tmp_path / "report.html").write_text(page, encoding="utf-8")
+    browser.show((tmp_path / "report.html").as_uri(), 1280, DRAWN)
+    browser.click("#sheet summary")
+    browser.wait("document.querySelectorAll('#rolling .main-svg').length > 0")
+    chart = Page(page).data
+    first = next(i for i, value in enumerate(chart["strategies"][0]["sharpe"]) if value is not None)
+    shown = browser.evaluate("document.getElementById('rolling').layout.xaxis.range")
+    assert [day[:10] for day in shown] == [chart["dates"][first], chart["dates"][-1]]
+
+
 def test_tear_sheet_opens_and_draws(browser: Browser, tmp_path: Path) -> None:
     browser.complaints.clear()
     (tmp_path / "report.html").write_text(render_backtest(usual(400)), encoding="utf-8")
@@ -288,7 +301,8 @@ def test_intervals_are_bars_until_numbers_are_wanted(browser: Browser, folder: P
 
 def test_wide_tables_say_so_on_a_phone(browser: Browser, folder: Path) -> None:
     url, label = (folder / "report.html").as_uri(), "Table of statistics"
-    assert not browser.cued(url, 1280, label)
+    for whole in (label, "Table of probabilistic and deflated Sharpe ratios"):
+        assert not browser.cued(url, 1200, whole)
     assert browser.cued(url, 375, label)
     frame = f"document.querySelector('[aria-label=\"{label}\"]')"
     browser.evaluate(f"{frame}.scrollTo(10000, 0)")

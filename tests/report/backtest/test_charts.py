@@ -30,14 +30,32 @@ def test_numbers_of_the_charts(data: BacktestData, page: Page) -> None:
     assert dqn["band"]["high"][-1] == pytest.approx(wealth.max(), rel=1e-3)
     assert dqn["cost"][-1] == pytest.approx(1 - np.prod(1 - series.cost, axis=1).mean(), rel=0.01)
     january = data.trades.astype("datetime64[M]") == np.datetime64("2001-01")
-    traded = series.turnover[:, january].sum(axis=1).mean()
-    assert dqn["turnover"][0] == pytest.approx(traded, rel=1e-3)
+    traded = series.turnover[:, january].sum(axis=1) - series.turnover[:, 0]
+    assert dqn["turnover"][0] == pytest.approx(traded.mean(), rel=1e-3)
     assert min(equal["drawdown"]) < 0 == max(equal["drawdown"])
     assert equal["band"] is None
     # Told apart without colors, too.
     looks = [(s["symbol"], s["dash"]) for s in chart["strategies"]]
     assert len(set(looks)) == len(looks)
     assert dqn["width"] == pathwise["width"] > max(s["width"] for s in chart["strategies"][3:])
+
+
+def test_the_first_purchase_does_not_flatten_the_turnover() -> None:
+    """Each seed buys on another day; a month that has only this day is left open."""
+    data = usual(60)
+    january = data.trades.astype("datetime64[M]") == data.trades[0].astype("datetime64[M]")
+    traded = np.full_like(data.strategies["DQN"].turnover, 0.001)
+    for seed, first in enumerate((0, 1, 3)):
+        traded[seed, :first], traded[seed, first] = 0, 1
+    dqn = replace(data.strategies["DQN"], turnover=traded)
+    shown = replace(data, strategies={**data.strategies, "DQN": dqn})
+    turnover = Page(render_backtest(shown)).data["strategies"][0]["turnover"]
+    traded_days = january.sum() - np.array([1, 2, 4])
+    assert turnover[0] == pytest.approx(0.001 * traded_days.mean(), rel=1e-3)
+    assert max(turnover) < 0.03
+    late = replace(data, begin=data.dates[0] - np.timedelta64(60, "D"))
+    turnover = Page(render_backtest(late)).data["strategies"][3]["turnover"]
+    assert [each is None for each in turnover[:2]] == [True, False]
 
 
 def test_a_long_name_leaves_the_picture_its_room() -> None:

@@ -46,7 +46,7 @@ def test_says_what_the_test_is(page: Page) -> None:
         "1, walk-forward: training on a rolling window of 2y, then a test of 6m",
         "12: 2 agents × 3 seeds, 1 ensemble, and 5 earlier trials on these prices.",
         "after Holm’s correction for 24 comparisons",
-        "no order gives an asset more than 30.0%",
+        "no order of an agent or a baseline gives an asset more than 30.0%",
         "Market impact",
         "Taxes.",
         "cash earns nothing",
@@ -60,6 +60,38 @@ def test_says_what_the_test_is(page: Page) -> None:
     ):
         assert sentence in page.text, sentence
     assert "Exceptions" not in page.text
+
+
+def test_the_users_own_strategies_are_no_baselines(data: BacktestData, page: Page) -> None:
+    assert "Agents are in color" in page.text
+    assert "The best baseline, best of all, is the one" in page.text
+    own = replace(data.strategies["best of all"], kind="strategy")
+    strategies = {**data.strategies, "best of all": own}
+    text = Page(render_backtest(make_data(strategies, data.dates, data.assets))).text
+    assert "Agents and your own strategies are in color" in text
+    assert "The best strategy, best of all, is the one that grew most of your own and" in text
+    assert "less that of the best strategy, best of all, is" in text
+    assert "Log growth less best of all (best strategy)" in text
+    assert "best baseline" not in text
+
+
+def test_bars_have_the_color_of_their_strategy(data: BacktestData, page: Page) -> None:
+    table = render_backtest(data).split('aria-label="Table of statistics"')[1]
+    colors = re.findall(r"--own: var\(--(.*?)\)", table.split("</table>")[0])
+    assert colors[:3] == ["agent-1", "agent-2", "agent-3"]
+    assert colors == [each["color"] for each in page.data["strategies"][: len(colors)]]
+
+
+def test_exceptions_are_apart_where_a_list_is_printed_in_one_line(data: BacktestData) -> None:
+    notes = ["One is here.", "Another is there."]
+    page = render_backtest(replace(data, notes=notes))
+    assert re.search(r"<li>One is here.</li>\s+<li>Another is there.</li>", page)
+
+
+def test_bands_over_seeds_need_seeds(page: Page) -> None:
+    said = "bands span the worst to the best seed"
+    assert said in page.text
+    assert said not in Page(render_backtest(usual(30, seeds=1))).text
 
 
 def test_says_how_assets_enter_and_leave_the_table(data: BacktestData, page: Page) -> None:

@@ -411,6 +411,16 @@ def test_results_come_before_the_curves_and_keep_words_whole_on_a_phone(
     assert browser.evaluate("document.documentElement.scrollWidth") <= 390
 
 
+def test_results_of_a_backtest_fit_a_laptop(board: Board, browser: Browser, tmp_path: Path) -> None:
+    values = {**RESULT, "sortino": 0.8124, "calmar": 0.4312, "growth": 1.2511}
+    del values["regret"]
+    said = {"event": "result", "values": {"equal-weight-monthly": values}}
+    finished(tmp_path / "runs" / "us", "backtest", ["dqn"], *curve("dqn/2001", 1.0), said)
+    browser.show(board.url, 1200, "!document.getElementById('results').hidden")
+    frame = "document.querySelector('#results .scroll')"
+    assert browser.evaluate(f"{frame}.scrollWidth <= {frame}.clientWidth")
+
+
 def test_a_study_shows_what_it_found(board: Board, browser: Browser, tmp_path: Path) -> None:
     found = {"active_growth": 0.029, "low": 0.02, "high": 0.039, "z": 6.4}
     said = {"event": "result", "values": {"tilts": found}}

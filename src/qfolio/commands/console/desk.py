@@ -43,13 +43,15 @@ def print_allocation(
             rows.append((asset, quoted, *weights, money, count))
     cash = (figure(float(x[0]), ".2%") for x in (held, targets, after))
     print_table(heads, [*rows, ("cash", "", *cash, "", "")])
+    hidden = len(rows) < len(allocation.assets)
     kinds = ", ".join(f"{kind} {figure(money, ',.2f')}" for kind, money in allocation.costs.items())
     say(
         f"After the close of {allocation.date}: wealth {figure(allocation.wealth, ',.2f')}, "
         f"expected cost {figure(allocation.cost, ',.2f')}"
         f"{f' ({kinds})' if len(allocation.costs) > 1 else ''}, "
-        f"cash left {figure(allocation.cash_after, ',.2f')}. "
-        "Assets that are neither held nor wanted are not shown."
+        f"cash left {figure(allocation.cash_after, ',.2f')}."
+        + " Assets that are neither held nor wanted are not shown."
+        * hidden
     )
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from multiprocessing import connection, resource_tracker
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import jax
 
@@ -97,7 +97,7 @@ class _Pool:
         workers = {pipe: worker for worker, pipe in self._pipes.items()}
         heard: list[tuple[int, Message]] = []
         for pipe in connection.wait(list(workers), seconds):
-            assert isinstance(pipe, connection.Connection)
+            pipe = cast("connection.Connection", pipe)  # on Windows, of a class beside it
             worker = workers[pipe]
             try:
                 heard.append((worker, pickle.loads(pipe.recv_bytes())))

@@ -7,6 +7,7 @@ import contextlib
 import multiprocessing
 import os
 import pickle
+import signal
 import sys
 import threading
 import traceback
@@ -35,10 +36,13 @@ def prepare(environment: Mapping[str, str]) -> Ready:
 
 def environment(cores: int) -> dict[str, str]:
     """This process's settings of XLA and jax, adapted to a worker with ``cores`` cores."""
+    from qfolio.core.devices import CORES, of_cores
+
+    count = str(of_cores(cores))
     flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if _COUNT not in flag]
-    adapted = {"XLA_FLAGS": " ".join([*flags, f"{_COUNT}={cores}"])}
+    adapted = {CORES: str(cores), "XLA_FLAGS": " ".join([*flags, f"{_COUNT}={count}"])}
     if _CPUS in os.environ:  # it would take the place of the flag
-        adapted[_CPUS] = str(cores)
+        adapted[_CPUS] = count
     return adapted
 
 
@@ -57,6 +61,7 @@ def work(unpacker: "Unpacker", parcel: "Parcel", send: Callable[[Message], None]
 def serve(pipe: connection.Connection, cores: list[int], environment: dict[str, str]) -> None:
     """The main function of a process: runs jobs from the pipe until it is closed."""
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver's to act on; Windows cannot block it
     sys.stdout = sys.stderr  # what a user's own code prints; --json has the driver's for itself
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, cores)

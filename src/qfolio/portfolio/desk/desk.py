@@ -1,8 +1,8 @@
 """From a run to orders: allocations that the run's ledger records and can reproduce."""
 
 import datetime
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,11 +22,17 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk import notes
 from qfolio.portfolio.desk.allocated import Allocated
 from qfolio.portfolio.desk.allocation import Allocation, require_fresh
+from qfolio.portfolio.desk.doubts import require_plausible
 from qfolio.portfolio.desk.drivers import reasons, sentence
 from qfolio.portfolio.desk.history import revisions
 from qfolio.portfolio.desk.holdings import cashed_out, read_holdings
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
-from qfolio.portfolio.desk.orders_csv import order_rows, require_apart, written
+from qfolio.portfolio.desk.orders_csv import (
+    order_rows,
+    prepared,
+    require_apart,
+    require_outside,
+)
 from qfolio.portfolio.desk.standing import Kind, Standing
 from qfolio.portfolio.desk.untrained import Ordered, Rule, Untrained
 from qfolio.portfolio.mandate.limits import lots
@@ -218,7 +224,9 @@ class Desk:
     ) -> Allocated:
         """Tomorrow's trades, which the ledger records.
 
-        If anything fails, the ledger, the policies and the file of orders stay as they were.
+        If anything fails, the ledger and the file of orders stay as they were. If the process is
+        killed, the orders are those before it until there is a record, and the same allocation made
+        again writes its own. A policy may have been updated in both cases; it is followed then.
 
         Args:
             agent, holdings, capital, anyway, whole_shares, as_of, update, orders, layout, currency,
@@ -226,31 +234,38 @@ class Desk:
             prices: Anything that ``qfolio.load_prices`` reads (default: those of the backtest).
 
         Raises:
-            QfolioError: The backtest advises against the agent, an input does not fit, or the
-                policy has learned from later prices.
+            QfolioError: The backtest advises against the agent, an input does not fit, the last
+                prices are doubtful, or the policy has learned from later ones.
         """
         source = None if holdings is None else path_of("holdings", holdings)
         place = None if orders is None else path_of("orders", orders)
         if place is not None:
             require_apart(place, "--prices", prices)
             require_apart(place, "--holdings", source)
+            require_outside(self.folder, place, "--orders")
         name = next(iter(self.run.agents)) if agent is None else agent
         standing = Standing.of(self.folder, name, self.kind(name))
         if not anyway:
             standing.require_sound(self.resume, named=agent is not None)
-        followed = self.followed(name)
+        stored = self.run.newest(name) if standing.kind == "agent" else None
+        followed = self.followed(name, stored)
         table = self.table(followed, prices)
         if table.levels:
             in_shares = whole_shares or holdings is not None or orders is not None
             _require_weights_alone(followed, in_shares)
         require_fresh(table, as_of)
+        if not anyway:
+            require_plausible(table)
         held = read_holdings(source, table.assets, capital, debts=self.debts)
         shares, cash, said = cashed_out(*held, table)
         updated = None
         if update:
             if not isinstance(followed, Policy):
                 raise QfolioError(f"{name} learns nothing; leave out --update.")
-            followed = updated = followed.update(table)
+            if followed.learned == table.dates[-1]:  # as when this is done again
+                said += notes.learned(followed)
+            else:
+                followed = updated = followed.update(table)
         hindsight = notes.hindsight(followed, table)
         if hindsight and not anyway:
             raise QfolioError(
@@ -279,11 +294,14 @@ class Desk:
         said += self.terms(followed, table, allocation, spent)
         record, done = None, "A dry run: nothing is written."
         if not dry_run:
-            with nullcontext() if wanted is None else written(*wanted):
+            with nullcontext(lambda: None) if wanted is None else prepared(*wanted) as write:
                 if hindsight:
+                    write()
                     done = f"{hindsight}, so that nothing is recorded."
                 else:
-                    record, done = self.record(name, allocation, table, whole_shares, updated)
+                    record, done = self.record(
+                        name, allocation, table, whole_shares, stored, updated, write
+                    )
             if wanted is not None:
                 done += f" {wanted[0]} has {amount(len(wanted[-1]), 'order')}."
         said.append(done)
@@ -351,22 +369,33 @@ class Desk:
         allocation: Allocation,
         prices: Prices,
         whole_shares: bool,
+        stored: str | None = None,
         updated: Policy | None = None,
+        then: Callable[[], object] = lambda: None,
     ) -> tuple[Record, str]:
-        """Appends an allocation by the newest policy of an agent, or by another strategy.
+        """Appends an allocation by a policy of an agent, or by another strategy.
 
-        updated: the policy that becomes the agent's newest with this record.
+        stored: name of the policy. updated: what it has become, the agent's newest from now on.
+        then: called once there is a record, which goes again if this fails.
 
         Returns the record, and a sentence that says what was done.
+
+        Raises QfolioError if another process updates the policy or allocates at the same time.
         """
         held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
-        newest = self.run.newest(name) if name in self.run.agents else None
-        with nullcontext(newest) if updated is None else self._keeping(name, updated) as stored:
+        with self.ledger.locked():
+            if updated is not None:
+                if self.run.newest(name) != stored:
+                    raise QfolioError(
+                        f"Another process has updated {name} meanwhile; allocate again."
+                    )
+                stored = self.run.keep(name, updated)
             digests = {"prices": prices.sha256, "holdings": held, **self._digests(name, stored)}
             return self.ledger.append(
                 allocation,
                 prices,
                 keep_prices=prices.sha256 != self.run.prices.sha256,
+                then=then,
                 agent=name,
                 policy=stored,
                 digests=digests,
@@ -374,19 +403,6 @@ class Desk:
                 made=datetime.datetime.now().astimezone().isoformat(" ", "seconds"),
                 version=__version__,
             )
-
-    @contextmanager
-    def _keeping(self, name: str, updated: Policy) -> Iterator[str]:
-        """Stores an updated policy for a block, which gets its name; it goes if the block fails.
-
-        Otherwise the next try would find that the policy has already learned from the new rows.
-        """
-        stored = self.run.keep(name, updated)
-        try:
-            yield stored
-        except BaseException:
-            BacktestFolder(self.folder).policy_file(name, stored).unlink(missing_ok=True)
-            raise
 
     def reproduce(
         self,

@@ -7,7 +7,8 @@ overwritten. Records are only ever added; of several for one date, the last one 
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -125,15 +126,34 @@ class Ledger:
             )
         return found[-1]
 
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Nobody else adds a record within the block.
+
+        Raises QfolioError if another process is about to.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with locked(self.folder):
+            yield
+
     def append(
-        self, allocation: Allocation, prices: Prices, *, keep_prices: bool, **facts: Any
+        self,
+        allocation: Allocation,
+        prices: Prices,
+        *,
+        keep_prices: bool,
+        then: Callable[[], object] = lambda: None,
+        **facts: Any,
     ) -> tuple[Record, str]:
         """Adds a record, unless the last one of the same date has the same inputs and orders.
+
+        Only for who holds the lock.
 
         Args:
             allocation: The allocation.
             prices: The table that it used.
             keep_prices: Whether to store the table; if not, it is needed again to reproduce.
+            then: Called once there is a record; a new one goes again if this fails.
             facts: The other fields of the record, except number, date and what it supersedes.
 
         Returns:
@@ -142,31 +162,35 @@ class Ledger:
         Raises:
             QfolioError: The trades of the last record of the same date have been made.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with locked(self.folder):
-            records = self.records()
-            content = {**_of(allocation), **facts}
-            before = next((r for r in reversed(records) if r.date == content["date"]), None)
-            if before is not None and not (differing := _differing(before, content)):
-                return before, f"This allocation is already record {before.number} of the ledger."
-            if before is not None and _traded(before, content) and DECIDES.isdisjoint(differing):
-                raise QfolioError(
-                    f"The holdings are those of record {before.number} of {before.date} after its "
-                    "trades, so that nothing more is ordered on these prices; allocate on later "
-                    "ones, or look with --dry-run."
-                )
-            record = msgspec.convert(
-                {
-                    **content,
-                    "number": 1 + max((r.number for r in records), default=0),
-                    "supersedes": None if before is None else before.number,
-                },
-                Record,
+        records = self.records()
+        content = {**_of(allocation), **facts}
+        before = next((r for r in reversed(records) if r.date == content["date"]), None)
+        if before is not None and not (differing := _differing(before, content)):
+            then()
+            return before, f"This allocation is already record {before.number} of the ledger."
+        if before is not None and _traded(before, content) and DECIDES.isdisjoint(differing):
+            raise QfolioError(
+                f"The holdings are those of record {before.number} of {before.date} after its "
+                "trades, so that nothing more is ordered on these prices; allocate on later "
+                "ones, or look with --dry-run."
             )
-            if keep_prices:
-                self._keep(prices)
-            path = self.folder / f"{record.number:04d}.json"
-            write_json(path, msgspec.to_builtins(record))
+        record = msgspec.convert(
+            {
+                **content,
+                "number": 1 + max((r.number for r in records), default=0),
+                "supersedes": None if before is None else before.number,
+            },
+            Record,
+        )
+        if keep_prices:
+            self._keep(prices)
+        path = self.folder / f"{record.number:04d}.json"
+        write_json(path, msgspec.to_builtins(record))
+        try:
+            then()
+        except BaseException:
+            path.unlink()
+            raise
         said = f"Recorded in the ledger as {path}."
         if before is not None:
             others = [f"{'other' if key[-1] == 's' else 'another'} {key}" for key in differing]

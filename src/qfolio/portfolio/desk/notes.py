@@ -42,6 +42,14 @@ def hindsight(followed: Policy | Untrained, table: Prices) -> str:
     )
 
 
+def learned(policy: Policy) -> list[str]:
+    """Says why a policy that was to be updated is not."""
+    return [
+        f"The policy has already learned from the prices up to {day(policy.learned)}, and is "
+        "followed as it is."
+    ]
+
+
 def ended(table: Prices, which: list[int]) -> list[str]:
     """Says so if assets have ended since the backtest."""
     if not which:

@@ -4,14 +4,14 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import write_bytes, write_csv
+from qfolio.core.files import UNFINISHED, naming, write_csv
 from qfolio.core.text import near, quote
 from qfolio.portfolio.desk.allocation import Allocation
 
@@ -38,26 +38,55 @@ def order_rows(allocation: Allocation, layout: str, currency: str) -> tuple[list
 
 
 @contextmanager
-def written(path: Path, header: list[str], rows: Rows) -> Iterator[None]:
-    """Writes orders before a block, which records them: nothing is recorded that is not written.
+def prepared(path: Path, header: list[str], rows: Rows) -> Iterator[Callable[[], object]]:
+    """Orders under a temporary name; within the block, the function that it gets names them so.
 
-    If the block fails, an earlier file is restored, or a new one removed.
+    What cannot be written is found before anything is recorded, and earlier orders stay until then,
+    even if the process is killed.
+
+    Raises QfolioError if the path is a folder or, like a device, no regular file.
     """
-    earlier = path.read_bytes() if path.is_file() else None
-    write_csv(path, header, rows)
+    target = _real(path)  # a link stays one
+    if (target.exists() or target.is_symlink()) and not target.is_file():  # a link in a loop, too
+        raise QfolioError(f"{path} is no regular file; name another for the orders.")
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.new{UNFINISHED}")
+    with naming(path):
+        write_csv(temporary, header, rows)
+
+    def place() -> None:
+        with naming(path):
+            temporary.replace(target)
+
     try:
-        yield
-    except BaseException:
-        path.unlink(missing_ok=True)  # first: a full disk may need its room
-        if earlier is not None:
-            write_bytes(path, earlier)
-        raise
+        yield place
+    finally:
+        with suppress(OSError):  # on a disk that has become read-only
+            temporary.unlink(missing_ok=True)
 
 
-def require_apart(orders: Path, option: str, source: Any) -> None:
-    """Raises QfolioError if orders would replace the file of an option, which is read."""
-    if isinstance(source, str | os.PathLike) and Path(source).resolve() == orders.resolve():
-        raise QfolioError(f"{option} and --orders name one file; give orders their own.")
+def require_apart(
+    written: Path, option: str, source: Any, *, by: str = "--orders", what: str = "orders"
+) -> None:
+    """Raises QfolioError if a file that is written would replace one that an option reads.
+
+    by: the option that names the file, for the message. what: its content, likewise.
+    """
+    if isinstance(source, str | os.PathLike) and _real(source) == _real(written):
+        raise QfolioError(f"{option} and {by} name one file; give {what} their own.")
+
+
+def require_outside(run: Path, written: Path, option: str) -> None:
+    """Raises QfolioError if a file would lie in the folder of a run, and might replace its own."""
+    if _real(written).is_relative_to(_real(run)):
+        raise QfolioError(
+            f"{option} is {written}, in the folder of the backtest, which has its own files there; "
+            "name a place outside of it."
+        )
+
+
+def _real(path: os.PathLike[str] | str) -> Path:
+    """What a path leads to; of links in a loop, one of them."""
+    return Path(os.path.realpath(path))
 
 
 def _generic(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:

@@ -155,15 +155,18 @@ class Ordered(Untrained):
     def notes(self, prices: Any, held: Floats | None = None, *, spent: float = 0.0) -> list[str]:
         """Says of which date the order is, and where it breaks the mandate, but for risk.
 
-        Without the weights held, turnover and the smallest trade are not checked.
+        An asset, which is bought once, needs no date. Without the weights held, turnover and the
+        smallest trade are not checked.
         """
         table = self.table(prices)
-        latest, last = self._latest(table), day(table.dates[-1])
-        ordered = day(self.own.dates[latest])
-        said = [f"These are the weights of {self.name} of {ordered}, its latest up to {last}."]
-        if self.name not in self.assets:  # which is bought once
-            ends = day(self.own.dates[-1])
-            said = [f"{said[0][:-1]} in the backtest's copy, which ends on {ends}."]
+        if self.name in self.assets:
+            said = [f"{self.name} is bought with all the money, and held."]
+        else:
+            dates, latest = self.own.dates, self._latest(table)
+            said = [
+                f"These are the weights of {self.name} of {day(dates[latest])}, its latest up to "
+                f"{day(table.dates[-1])} in the backtest's copy, which ends on {day(dates[-1])}."
+            ]
         if self.mandate:
             there = ~np.isnan(table.values[-1])
             mandated, _ = checks.relaxed(feasible(self.mandate, there, self.cap))
@@ -177,8 +180,8 @@ class Ordered(Untrained):
             broken = [f"{what} {by:.2g}" for what, by in found.items() if by > TOLERANCE]
             if broken:
                 said.append(
-                    f"They break the mandate ({', '.join(broken)}), and are carried out all the "
-                    "same, as in the backtest."
+                    f"The weights break the mandate ({', '.join(broken)}), and are carried out all "
+                    "the same, as in the backtest."
                 )
         return said
 

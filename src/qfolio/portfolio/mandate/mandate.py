@@ -154,7 +154,7 @@ class Mandate(Section, frozen=True):
         """
         path = Path(path)
         try:
-            content = tomllib.loads(path.read_text("utf-8"))
+            content = tomllib.loads(path.read_text("utf-8-sig"))
         except OSError as error:
             raise QfolioError(f"The mandate {path} cannot be read: {error.strerror}.") from None
         except UnicodeDecodeError:
@@ -309,8 +309,13 @@ def _converted(content: Any, source: str) -> Mandate:
         key = key or "the mandate"
         if kind == "key in ":  # from Python, whose dictionaries may have other keys than text
             key, value = f"a key in {key}", next(x for x in value if not isinstance(x, str))
+        wanted = _wanted(text)
+        if wanted == "a list":  # on the command line, its quotes need some around them
+            example = '["USO"]'
+            example = f"'{key}={example}'" if source == "--limits" else example
+            wanted += f", such as {example}"
         raise QfolioError(
-            f"{source}: {key} is {reprlib.repr(value)}; it must be {_wanted(text)} (see "
+            f"{source}: {key} is {reprlib.repr(value)}; it must be {wanted} (see "
             "docs/guides/mandate.md)."
         ) from None
 

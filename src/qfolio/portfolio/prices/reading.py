@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.files import path_of
 from qfolio.core.text import quote
 from qfolio.portfolio.prices.delimited import from_text
 from qfolio.portfolio.prices.header import name_columns
@@ -33,7 +34,7 @@ def read(source: Any, texts: Callable[[tuple[str, ...]], set[int]]) -> Table:
     """
     if not isinstance(source, str | Path):
         return upright(_from_frame(source))
-    path = Path(source)
+    path = path_of("prices", source)
     kind = path.suffix.lower()
     if kind not in ("", *TEXT_FILES, *PARQUET_FILES):
         raise QfolioError(

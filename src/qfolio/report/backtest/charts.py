@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.statistics.tearsheet import rolling_beta, rolling_sharpe
 from qfolio.report import palette
 from qfolio.report.backtest.data import BacktestData, StrategySeries, faint_names
@@ -86,8 +87,21 @@ def _lines(
         else None,
         "drawdown": compact(np.append(0, -deepest)),
         "cost": compact(np.append(0, cost_share(series)[ends])),
-        "turnover": compact(np.add.reduceat(series.turnover.mean(axis=0), months), 5),
+        "turnover": compact(_monthly_turnover(series, months), 5),
     }
+
+
+def _monthly_turnover(series: StrategySeries, months: NDArray[np.intp]) -> Floats:
+    """Turnover of each month without the first trade, the mean over the seeds.
+
+    That trade buys from cash. It is so much larger than all others that they would look like zero.
+    NaN for a month without any other day, and where only returns are known.
+    """
+    traded = series.turnover.copy()
+    traded[np.arange(len(traded)), (traded > 0).argmax(axis=1)] = np.nan
+    known = np.logical_or.reduceat(~np.isnan(traded), months, axis=1)
+    sums = np.add.reduceat(np.nan_to_num(traded), months, axis=1)
+    return np.asarray(np.where(known, sums, np.nan).mean(axis=0))
 
 
 def days_per_point(days: int) -> int:

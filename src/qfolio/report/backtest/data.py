@@ -137,6 +137,11 @@ def shown_order(data: BacktestData) -> list[str]:
     return list(dict.fromkeys([*main_names(data), *others]))
 
 
+def best_word(name: str, data: BacktestData) -> str:
+    """What to call the best of the baselines and the user's own strategies."""
+    return "best strategy" if data.strategies[name].kind == "strategy" else "best baseline"
+
+
 def faint_names(data: BacktestData) -> list[str]:
     """All but the agents, the reference and the best baseline; charts hide them at first."""
     test = data.assessment

@@ -21,7 +21,7 @@ from qfolio.portfolio.backtest.statistics.verdict import (
     wiped_out,
 )
 from qfolio.report.axis import Axis, ticks_around
-from qfolio.report.backtest.data import BacktestData, followed_names, shown_order
+from qfolio.report.backtest.data import BacktestData, best_word, followed_names, shown_order
 from qfolio.report.rendering import number, percent
 
 Standing = Literal["better", "none", "worse", "ruined"]
@@ -160,7 +160,8 @@ def best_sentence(data: BacktestData) -> str:
     p = rival.sharpe.p_holm
     corrected = "" if p is None else f"; corrected p {p_text(p)}"
     return (
-        f"{said} The Sharpe ratio of {lead} less that of the best baseline, {rival.reference}, is "
+        f"{said} The Sharpe ratio of {lead} less that of the "
+        f"{best_word(rival.reference, data)}, {rival.reference}, is "
         f"{number(rival.sharpe.value, 2, sign=True)} (95% interval {low} to {high}{corrected})."
     )
 

@@ -26,7 +26,13 @@ from qfolio.report.backtest.charts import (
     rolling_window,
 )
 from qfolio.report.backtest.convergence import convergence_sentences, draw_convergence
-from qfolio.report.backtest.data import BacktestData, main_names, require_fit, shown_order
+from qfolio.report.backtest.data import (
+    BacktestData,
+    best_word,
+    main_names,
+    require_fit,
+    shown_order,
+)
 from qfolio.report.backtest.facts import account, few_seeds, key_facts, unit_of
 from qfolio.report.backtest.holdings import BLOCKS
 from qfolio.report.backtest.looks import looks_of
@@ -105,6 +111,8 @@ def render_backtest(data: BacktestData) -> str:
         hidden=payload["hidden"],
         conclusion=conclusion(data),
         best=best_sentence(data),
+        best_word=best_word(data.assessment.best_baseline, data),
+        own=any(series.kind == "strategy" for series in data.strategies.values()),
         leading=(leading := lead_name(data)),
         rival=rival_name(data),
         start=names.index(leading or data.assessment.reference),

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from qfolio.core.statistics import FEWEST_SEEDS
-from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment
+from qfolio.portfolio.backtest.statistics.assessment import JUDGED
 from qfolio.portfolio.backtest.statistics.differences import Difference
 from qfolio.portfolio.backtest.statistics.estimates import MEASURED, Measured
 from qfolio.portfolio.backtest.statistics.measures import growth_at, monthly
@@ -17,7 +17,7 @@ from qfolio.portfolio.backtest.statistics.sampled import Measure
 from qfolio.portfolio.backtest.statistics.verdict import comparable, luck, shown, telling, wiped_out
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL
 from qfolio.report.axis import Axis
-from qfolio.report.backtest.data import BacktestData, main_names
+from qfolio.report.backtest.data import BacktestData, best_word, main_names
 from qfolio.report.backtest.facts import basis_points
 from qfolio.report.rendering import number, percent, shade
 
@@ -122,10 +122,9 @@ def _over_seeds(measure: Measure) -> tuple[float, ...]:
 
 def difference_headings(data: BacktestData) -> list[str]:
     """The column headings of ``difference_rows``."""
-    test = data.assessment
     return [
         f"{_MEASURED[key]} {name}{remark}"
-        for _, name, remark, keys in _comparisons(test)
+        for _, name, remark, keys in _comparisons(data)
         for key in keys
     ]
 
@@ -137,7 +136,7 @@ def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None
     """
     entry = data.assessment.strategies[name]
     cells: list[dict[str, str] | None] = []
-    for field, _, _, keys in _comparisons(data.assessment):
+    for field, _, _, keys in _comparisons(data):
         difference: Difference | None = getattr(entry, field)
         for key in keys:
             if difference is None:
@@ -165,8 +164,9 @@ def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None
     return cells
 
 
-def _comparisons(test: Assessment) -> list[tuple[str, str, str, tuple[Measured, ...]]]:
+def _comparisons(data: BacktestData) -> list[tuple[str, str, str, tuple[Measured, ...]]]:
     """For each comparison: its field, the other strategy, a remark, and the measures shown."""
+    test = data.assessment
     found = [("to_reference", test.reference, "", MEASURED)]
     if any(entry.to_rebalanced is not None for entry in test.strategies.values()):
         found.append(("to_rebalanced", test.rebalanced, " (best rebalancing)", MEASURED))
@@ -174,7 +174,8 @@ def _comparisons(test: Assessment) -> list[tuple[str, str, str, tuple[Measured, 
     if test.best_sharpe == test.best_baseline:
         of_best = ("growth", "sharpe")
     if test.best_baseline != test.reference:
-        found.append(("to_best_baseline", test.best_baseline, " (best baseline)", of_best))
+        remark = f" ({best_word(test.best_baseline, data)})"
+        found.append(("to_best_baseline", test.best_baseline, remark, of_best))
     if test.best_sharpe not in (test.reference, test.best_baseline):
         remark = " (highest Sharpe ratio)"
         found.append(("to_best_sharpe", test.best_sharpe, remark, ("sharpe",)))

@@ -6,6 +6,7 @@ that no other page can read its answers. Reports run in a sandbox without an ori
 """
 
 import functools
+import os
 import re
 from collections.abc import Callable
 from http import HTTPStatus
@@ -40,6 +41,7 @@ class Board(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    allow_reuse_address = os.name != "nt"  # where it would let two boards share a port
     request_queue_size = 64
 
     def __init__(self, root: Path, port: int) -> None:

@@ -82,6 +82,7 @@
     const chart = byId("rolling");
     if (!chart || !byId("sheet").open) return undefined;
     const view = inView(chart, data.dates);
+    const from = data.dates.findIndex((_, i) => data.strategies.some((s) => s.sharpe[i] !== null));
     const [low, high] = extent(shown().map((s) => s.sharpe), view) || [0, 1];
     const edge = 0.06 * (high - low) || 0.1;
     return Plotly.react(chart,
@@ -89,7 +90,7 @@
       layout(state.printing ? 290 : narrow.matches ? 440 : 470, {
         margin: { r: room(names.filter((_, index) => !hidden.has(index))) },
         titles: [["Sharpe ratio of the last year", 1], ["Beta of the last year", 0.36]],
-        xaxis: { anchor: "y2" },
+        xaxis: { anchor: "y2", range: [data.dates[Math.max(from, 0)], data.dates[atEnd()]] },
         yaxis: { domain: [0.46, 1], range: [low - edge, high + edge], nticks: 6 },
         yaxis2: { domain: [0, 0.36], nticks: 5 },
         shapes: [{ yref: "y", y0: 0, y1: 0 }],
