@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
-from qfolio.core.text import near, plain, printable
+from qfolio.core.text import near, plain_signs, printable
 from qfolio.core.version import __version__
 from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 
@@ -37,17 +37,13 @@ Examples:
   qfolio --version               show the version"""
 
 
-UNPRINTED = 3
-"""Exit code where a command did its work, and only printing failed."""
-
-
 def main() -> NoReturn:
     """Runs the program; Ctrl-C ends it at once, or after the current chunk of a training."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:  # closed, as by ">&-": no other file may get its number
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
     exit_on_ctrl_c()
-    codecs.register_error("qfolio", plain)
+    codecs.register_error("qfolio", plain_signs)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="qfolio")  # a file may have an encoding without "·" or "−"
@@ -87,11 +83,16 @@ def run() -> NoReturn:
     except BrokenPipeError:  # such as: qfolio prices table.csv | head
         _discard(sys.stdout)
     except Exception as error:
-        code = UNPRINTED if _unprinted(error) else 2
+        try:
+            sys.stdout.flush()
+        except OSError:  # the output is what failed, as on a full disk
+            _discard(sys.stdout)
+            if isinstance(error, OSError) and not error.filename:
+                error.filename = "standard output"
         if (sentence := told(error)) is None:
             raise
         _say(sentence)
-        sys.exit(code)
+        sys.exit(2)
     except KeyboardInterrupt:
         _say("interrupted")
         sys.exit(EXIT_CODE)
@@ -173,19 +174,6 @@ def _named(text: str) -> Callable[[], None]:
 
     command.__doc__ = text
     return command
-
-
-def _unprinted(error: Exception) -> bool:
-    """Whether standard output is what failed, as on a full disk; if so, the error names it."""
-    nameless = isinstance(error, OSError) and not error.filename
-    try:  # without a buffer, only a line more tells
-        print(end="\n" if nameless else "", flush=True)
-    except OSError:
-        _discard(sys.stdout)
-        if isinstance(error, OSError) and nameless:
-            error.filename = "standard output"
-            return True
-    return False
 
 
 def _discard(stream: TextIO) -> None:

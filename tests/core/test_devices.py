@@ -79,9 +79,9 @@ def test_without_a_cache_that_can_be_written_nothing_is_said():
 
 
 def test_memory_counts_every_slot(monkeypatch):
-    """On a CPU a device has two at least: one member alone takes twice its state."""
+    """On a CPU there are two devices with two each at least: one member alone has four."""
     members = devices.Members(1)
-    assert members.slots == 2 * len(members.taken)
+    assert (members.slots, len(members.taken)) == (4, 2)
     state = jax.ShapeDtypeStruct((2**18,), "float32")  # 1 MiB
     monkeypatch.setattr(devices, "host_memory", lambda: 2**20 * members.slots)
     devices.require_memory(state, members.slots)

@@ -142,6 +142,9 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
 def test_what_a_link_leads_to_is_replaced_and_the_link_stays(tmp_path):
     target, link = tmp_path / "sent" / "orders.csv", tmp_path / "orders.csv"
     link.symlink_to(target)
+    with pytest.raises(QfolioError, match=r"leads to .*sent, which is not there; make it first"):
+        write_bytes(link, b"none")  # as of a disk that is not mounted
+    target.parent.mkdir()
     for content in (b"first", b"second"):  # of a file that is not there yet, and of one that is
         write_bytes(link, content)
         assert (link.is_symlink(), target.read_bytes()) == (True, content)

@@ -13,7 +13,7 @@ from qfolio.core.text import (
     four_digits,
     listed,
     near,
-    plain,
+    plain_signs,
     printable,
     quote,
 )
@@ -34,7 +34,7 @@ def test_a_terminal_obeys_nothing(text: str, shown: str | None):
 
 
 def test_signs_outlive_an_encoding_without_them():
-    codecs.register_error("plain", plain)
+    codecs.register_error("plain", plain_signs)
     text = "−5.0% · 2 × 3 ≥ 1 – that’s é"
     assert text.encode("ascii", "plain") == b"-5.0% * 2 x 3 >= 1 - that's ?"
     assert "−é".encode("latin-1", "plain") == b"-\xe9"

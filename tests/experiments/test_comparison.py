@@ -375,7 +375,9 @@ def test_on_workers_it_is_the_same(tmp_path):
     assert resumed.finish()["ranking"]["order"] == here.finish()["ranking"]["order"]
 
 
-def test_what_workers_began_goes_on_here_in_the_same_log(tmp_path):
+def test_what_workers_began_goes_on_here_in_the_same_log(tmp_path, monkeypatch):
+    monkeypatch.setenv("QFOLIO_CORES", "1")  # a seed at a time
+
     def stop_in_the_second(job, done, share):
         return [Interrupt()] if job.name == "slow/1" else []
 
@@ -511,7 +513,7 @@ def test_what_settings_do_not_describe_is_refused_before_a_folder_is_made(tmp_pa
 @pytest.mark.parametrize(
     ("names", "says"),
     [(["Q fast", "q"], "An agent is called 'Q fast'; use letters"),
-     (["q-a", "q:a"], "q:a and q-a would share a folder")],
+     (["q-a", "q:a"], "q-a and q:a would share a folder")],
 )  # fmt: skip
 def test_names_that_no_folder_can_have_are_refused(names, says, tmp_path):
     """Such a comparison was created and could not be opened."""

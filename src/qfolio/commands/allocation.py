@@ -1,5 +1,6 @@
 """Commands of the desk: compute tomorrow's trades, and follow the ledger of past allocations."""
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,9 @@ from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
     from qfolio.portfolio.desk.desk import Desk
+
+UNPRINTED = 3
+"""Exit code where the allocation is recorded, its orders are written, and only printing failed."""
 
 Date = Annotated[str | None, arg(metavar="DATE", help_behavior_hint="")]
 
@@ -213,19 +217,22 @@ def follow(
 
 @contextmanager
 def _telling(done: str) -> Iterator[None]:
-    """Says on the standard error what was done where printing fails, as on a full disk.
+    """Ends the process with ``UNPRINTED`` where printing fails after something was done.
 
-    A reader who has gone, as in a pipe to head, is no failure. done: a sentence; empty if nothing
-    was done.
+    Code 2 would mean that nothing was recorded. A reader who has gone, as in a pipe to head, is no
+    failure. done: the sentence that says what was done; empty if nothing was.
     """
     try:
         yield
     except BrokenPipeError:
         raise
-    except OSError:
-        if done:
-            print(f"qfolio: {done}", file=sys.stderr)
-        raise
+    except OSError as error:
+        if not done:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to print
+        said = f"The allocation cannot be printed ({error.strerror or error}). {done}"
+        print(f"qfolio: {said}", file=sys.stderr)
+        sys.exit(UNPRINTED)
 
 
 def _reproduce(

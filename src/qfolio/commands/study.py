@@ -86,7 +86,8 @@ def study(
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1
             console.say(f"{place} of {len(run.places)}: {table}, {variant.text}")
-            for note in beforehand(backtest.config.agents, backtest.replay):
+            first = variant == run.config.variants[0]  # they are the same for all of a table
+            for note in beforehand(backtest.config.agents, backtest.replay) if first else ():
                 console.tell(note)
             return JobsProgress(update)
 

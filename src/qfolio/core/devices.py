@@ -108,12 +108,12 @@ def of_cores(cores: int) -> int:
     return max(FEWEST, cores)
 
 
-def busy() -> int:
-    """How many devices compute at once: on a CPU, as many as this process may use cores."""
+def in_use() -> int:
+    """How many devices compute at once: on a CPU, as many as this process uses cores."""
     there = len(jax.devices())
     if jax.devices()[0].platform in LOCKSTEP:
         return there
-    return min(there, int(os.environ.get(CORES, len(cores()))))
+    return min(there, int(os.environ.get(CORES) or len(cores())))
 
 
 def describe() -> str:
@@ -130,7 +130,7 @@ def describe() -> str:
             f"jax finds no device of JAX_PLATFORMS={platforms}; unset it, or install jax for this "
             "platform."
         ) from None
-    return f"{busy()} × {devices[0].device_kind} ({devices[0].platform})"
+    return f"{in_use()} × {devices[0].device_kind} ({devices[0].platform})"
 
 
 def circumstances(*programs: str) -> dict[str, Any]:
@@ -187,8 +187,8 @@ class Members:
         # program for one device nor keeps an axis of length one, and then rounds differently. An
         # empty slot costs memory, but no time.
         least = FEWEST if self.one_by_one else 1
-        devices = jax.devices()[: max(least, self.room)]
-        used = min(busy(), len(devices))
+        used = min(in_use(), self.room)
+        devices = jax.devices()[: max(least, used)]
         slots = max(least, -(-self.room // used))
         self.slots = slots * len(devices)
         self.form = (slots, len(devices), self.one_by_one)

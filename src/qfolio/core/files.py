@@ -72,17 +72,28 @@ def require_utf8(name: Path | str) -> None:
         ) from None
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Writes to a temporary name beside ``path``, then renames: a reader sees all or nothing.
+def target_of(path: Path) -> Path:
+    """The file that writing to ``path`` replaces: a link stays, and what it leads to is replaced.
 
-    A link stays, and what it leads to is replaced. Raises QfolioError if the path is a folder or,
-    like a pipe or a device, no regular file.
+    Raises QfolioError if it is a folder or, like a pipe or a device, no regular file, or if the
+    place that a link leads to is not there.
     """
     target = Path(os.path.realpath(path))
     if target.is_dir():
         raise QfolioError(f"{path} is a folder; name a file.")
     if (path.exists() or target.is_symlink()) and not path.is_file():  # a link in a loop, too
         raise QfolioError(f"{path} is no regular file; name another.")
+    if path.is_symlink() and not target.parent.is_dir():  # such as a disk that is not mounted
+        raise QfolioError(f"{path} leads to {target.parent}, which is not there; make it first.")
+    return target
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes to a temporary name beside ``path``, then renames: a reader sees all or nothing.
+
+    Raises QfolioError for what ``target_of`` refuses.
+    """
+    target = target_of(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{os.getpid()}{UNFINISHED}")
     try:

@@ -34,7 +34,7 @@ def printable(text: str) -> str:
     return "".join(ascii(c)[1:-1] if unicodedata.category(c) in UNSAFE else c for c in text)
 
 
-def plain(error: UnicodeError) -> tuple[str, int]:
+def plain_signs(error: UnicodeError) -> tuple[str, int]:
     """A handler of encoding errors (``codecs.register_error``) that keeps signs: see ``PLAIN``."""
     if not isinstance(error, UnicodeEncodeError):
         raise error

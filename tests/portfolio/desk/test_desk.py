@@ -120,8 +120,8 @@ def test_orders_go_where_a_link_leads_and_to_no_device(finished, tmp_path):
     Desk.open(folder).allocate(orders=orders, **of)
     assert orders.is_symlink()
     assert (tmp_path / "outbox.csv").read_text().count("MARKET") == 3
-    for place in (tmp_path, Path("/dev/null")):
-        with pytest.raises(QfolioError, match="is no regular file; name another for the orders"):
+    for place, said in ((tmp_path, "is a folder"), (Path("/dev/null"), "is no regular file")):
+        with pytest.raises(QfolioError, match=said):
             Desk.open(folder).allocate(orders=place, **of)
 
 
@@ -134,39 +134,43 @@ def doubtful_table(path, change):
     return path
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [(0.1, "a split that was not adjusted"), (0.45, "a wrong price")],
-    ids=["a cut number", "a crash"],
-)
-def test_a_doubtful_price_is_traded_on_demand_only(finished, tmp_path, change, said):
+def test_a_doubtful_price_is_traded_on_demand_only(finished, tmp_path):
     folder = shutil.copytree(finished, tmp_path / "run")
-    of: dict[str, Any] = {
-        "agent": "equal-weight", "prices": doubtful_table(tmp_path / "newer.csv", change),
-        "capital": 1000.0, "as_of": "2020-09-26",
-    }  # fmt: skip
-    found = rf"On 2020-09-26, the price of 'B' is .* the one before, .*: perhaps {said}; correct"
+    of: dict[str, Any] = {"agent": "equal-weight", "capital": 1000.0, "as_of": "2020-09-26"}
+    cut = doubtful_table(tmp_path / "newer.csv", 0.1)
+    found = (
+        r"On 2020-09-26, 'B' moves by a factor of 0.*, close to 1/10: perhaps a split .* was cut"
+    )
     with pytest.raises(QfolioError, match=found):
-        Desk.open(folder).allocate(**of)
+        Desk.open(folder).allocate(**of, prices=cut)
     assert numbers(folder) == []
-    assert Desk.open(folder).allocate(**of, anyway=True).record is not None
+    assert Desk.open(folder).allocate(**of, prices=cut, anyway=True).record is not None
     assert numbers(folder) == [1]
 
 
-def test_several_doubtful_prices_are_counted_and_earlier_ones_are_no_reason():
-    values = random_walk(270, assets=6)
+def test_a_crash_is_traded_with_a_warning(finished, tmp_path):
+    desk = Desk.open(shutil.copytree(finished, tmp_path / "run"))
+    crash = doubtful_table(tmp_path / "newer.csv", 0.45)
+    made = desk.allocate("equal-weight", crash, capital=1000.0, as_of="2020-09-26")
+    assert made.record is not None
+    assert [each.column for each in desk.news if "perhaps a wrong price" in each.message] == ["B"]
+
+
+def test_which_doubtful_prices_matter():
+    values, every = random_walk(270, assets=6), np.ones(6, bool)
     earlier = values.copy()
-    earlier[200:, 1] *= 0.3
-    require_plausible(price_table(earlier))
-    values[-1, 1:3] *= [0.3, 0.1]
-    with pytest.raises(QfolioError, match="and there is 1 more such move; correct the prices or"):
-        require_plausible(price_table(values))
+    earlier[200:, 1] *= 0.1
+    require_plausible(price_table(earlier), every)
+    values[-1, 1:3] *= [0.1, 0.01]
+    with pytest.raises(QfolioError, match=r"close to 1/10 \(1 more asset likewise\)"):
+        require_plausible(price_table(values), every)
+    require_plausible(price_table(values), np.isin(np.arange(6), (0, 3, 4, 5)))
 
 
 def test_a_haircut_is_no_doubtful_price():
     values, listed = random_walk(270), np.ones((270, 3), bool)
-    values[-1, 1], listed[-1, 1] = 0.3 * values[-2, 1], False
-    require_plausible(price_table(values, listed=listed))
+    values[-1, 1], listed[-1, 1] = 0.1 * values[-2, 1], False
+    require_plausible(price_table(values, listed=listed), np.ones(3, bool))
 
 
 def fails(*_, **__):

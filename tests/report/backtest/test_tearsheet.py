@@ -163,3 +163,10 @@ def test_a_thousand_assets_keep_the_page_small() -> None:
     page = render_backtest(make_data(series, weekdays(600), names, moves=moves))
     assert len(page.encode()) < 7e6
     assert "988 others" in Page(page).text
+
+
+def test_few_returns_have_no_value_at_risk() -> None:
+    each = tear_sheet(["DQN"], usual(15))["each"][0]["histogram"]
+    assert each["marks"] == []
+    assert each["label"] == "15 returns, too few for a value at risk"
+    assert 'x1="nan' not in render_backtest(usual(15))

@@ -33,6 +33,7 @@ class Allocated:
     record: Record | None
 
     def to_json(self) -> dict[str, Any]:
+        """What ``qfolio allocate --json`` prints."""
         return {
             "agent": self.standing.agent,
             "trained_until": self.trained,

@@ -163,6 +163,7 @@ class Allocation:
 
     @property
     def wealth(self) -> float:
+        """Value of the shares and cash before the trades."""
         return float(np.nansum(self.shares * self.prices) + self.cash)
 
     @property
@@ -183,6 +184,7 @@ class Allocation:
         return np.asarray(held / held.sum())
 
     def to_json(self) -> dict[str, Any]:
+        """The trades as values of JSON."""
         rows = zip(
             self.assets,
             [None if math.isnan(price) else price for price in self.prices.tolist()],

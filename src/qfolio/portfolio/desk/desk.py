@@ -88,6 +88,7 @@ class Desk:
 
     @property
     def ledger(self) -> Ledger:
+        """The records of past allocations."""
         return Ledger(self.folder / "ledger")
 
     @property
@@ -254,10 +255,11 @@ class Desk:
             in_shares = whole_shares or holdings is not None or orders is not None
             _require_weights_alone(followed, in_shares)
         require_fresh(table, as_of)
-        if not anyway:
-            require_plausible(table)
         held = read_holdings(source, table.assets, capital, debts=self.debts)
         shares, cash, said = cashed_out(*held, table)
+        if not anyway:
+            open_ = True if table.tradable is None else table.tradable[-1]
+            require_plausible(table, (shares != 0) | open_)
         updated = None
         if update:
             if not isinstance(followed, Policy):

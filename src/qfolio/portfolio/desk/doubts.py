@@ -1,40 +1,32 @@
 """Prices that are about to be traded although they may be wrong."""
 
-import numpy as np
-
+from qfolio.core.arrays import Bools
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import amount
-from qfolio.portfolio.prices.findings import Finding, Findings, day
-from qfolio.portfolio.prices.gaps import Rest
-from qfolio.portfolio.prices.grid import Block, Grid
-from qfolio.portfolio.prices.layout import Table
-from qfolio.portfolio.prices.moves import check_moves
+from qfolio.core.text import amount, quote
+from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.moves import sort_moves
 from qfolio.portfolio.prices.table import Prices
 
 
-def require_plausible(table: Prices) -> None:
-    """Raises QfolioError if a price of the last row, at which orders are made, is doubtful.
+def require_plausible(table: Prices, traded: Bools) -> None:
+    """Raises QfolioError if a move into the last row, at which orders are made, is that of a split.
 
-    A download that was cut within its last number looks like this, as does a true crash.
+    A number that a download was cut within looks the same. Other jumps, as in a crash, are only
+    warned of.
+
+    Args:
+        table: The prices of the decision.
+        traded: Which assets are held or may be bought, of shape (assets,).
     """
-    if not (found := _doubts(table)):
+    found, last = sort_moves(table.known), len(table) - 2
+    doubtful = {j: ratio for (i, j), ratio in found.splits.items() if i == last and traded[j]}
+    if not doubtful:
         return
-    count = sum(each.count for each in found) - 1
-    more = f", and there {'is' if count == 1 else 'are'} {amount(count, 'more such move')}"
+    (asset, ratio), *others = doubtful.items()
+    more = f" ({amount(len(others), 'more asset')} likewise)" if others else ""
     raise QfolioError(
-        f"On {found[0].date}, {found[0].message}{more * bool(count)}; correct the prices or, if "
-        "they did move like this, add --anyway."
+        f"On {day(table.dates[-1])}, {quote(table.assets[asset])} moves by a factor of "
+        f"{found.relatives[last, asset]:.4g}, close to {ratio}{more}: perhaps a split that was not "
+        "adjusted, another unit, or a number that was cut; correct the prices or, if they did move "
+        "like this, add --anyway."
     )
-
-
-def _doubts(table: Prices) -> list[Finding]:
-    """The warnings on moves that end at the last row."""
-    found, every = Findings(), np.arange(len(table.assets))
-    values = table.known
-    prices = Block(values, np.isnan(values), tuple(every.tolist()), "price", by_asset=True)
-    nowhere = np.full(values.shape, -1)
-    cells = Table(table.assets, (), 0, table.source)
-    grid = Grid(cells, True, table.dates, table.assets, nowhere, prices, ())
-    check_moves(grid, Rest(0, every, values, table.features), found)
-    last = day(table.dates[-1])
-    return [each for each in found if each.severity == "warning" and each.date == last]

@@ -46,7 +46,7 @@ def learned(policy: Policy) -> list[str]:
     """Says why a policy that was to be updated is not."""
     return [
         f"The policy has already learned from the prices up to {day(policy.learned)}, and is "
-        "followed as it is."
+        "followed as it is, even if they were corrected since."
     ]
 
 

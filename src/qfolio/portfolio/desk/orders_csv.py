@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import UNFINISHED, naming, write_csv
+from qfolio.core.files import UNFINISHED, naming, target_of, write_csv
 from qfolio.core.text import near, quote
 from qfolio.portfolio.desk.allocation import Allocation
 
@@ -44,11 +44,9 @@ def prepared(path: Path, header: list[str], rows: Rows) -> Iterator[Callable[[],
     What cannot be written is found before anything is recorded, and earlier orders stay until then,
     even if the process is killed.
 
-    Raises QfolioError if the path is a folder or, like a device, no regular file.
+    Raises QfolioError for what ``target_of`` refuses.
     """
-    target = _real(path)  # a link stays one
-    if (target.exists() or target.is_symlink()) and not target.is_file():  # a link in a loop, too
-        raise QfolioError(f"{path} is no regular file; name another for the orders.")
+    target = target_of(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.new{UNFINISHED}")
     with naming(path):
         write_csv(temporary, header, rows)

@@ -7,10 +7,11 @@ price moves by as much, or it is about to be traded.
 """
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.core.text import amount, quote
 from qfolio.portfolio.prices.findings import LISTED, Findings, day, first_of
 from qfolio.portfolio.prices.frequency import periods_per_year
@@ -38,14 +39,34 @@ EMPTY_IT = "If so, correct it, or empty the cell and choose missing='forward-fil
 Jump = tuple[int, int]  # the row before the jump, and the asset
 
 
+class Sorted(NamedTuple):
+    """The moves of prices (rows × assets), and their jumps by what they look like.
+
+    ticks: bad ticks, with the rows that they last. splits: with their ratios. others: the rest.
+    """
+
+    values: Floats
+    relatives: Floats
+    moves: Floats
+    ticks: dict[Jump, int]
+    splits: dict[Jump, str]
+    others: list[Jump]
+
+
+def sort_moves(values: Floats) -> Sorted:
+    """Sorts out the jumps of prices; those that are missing or not positive are left out."""
+    values = np.where(np.isfinite(values) & (values > 0), values, np.nan)
+    with np.errstate(over="ignore", divide="ignore", under="ignore"):
+        relatives, logs = values[1:] / values[:-1], np.log(values)
+    moves = np.diff(logs, axis=0)
+    jumps = _jumps(values, moves, np.abs(moves))
+    return Sorted(values, relatives, moves, *_sort_out(logs, moves, jumps))
+
+
 def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
     """Report impossible moves, bad ticks, likely splits and other jumps."""
-    values = np.where(np.isfinite(rest.values) & (rest.values > 0), rest.values, np.nan)
-    with np.errstate(over="ignore", divide="ignore", under="ignore"):
-        relatives = values[1:] / values[:-1]
-        logs = np.log(values)
-    moves, dates = np.diff(logs, axis=0), grid.dates[rest.head :]
-    sizes = np.abs(moves)
+    values, relatives, moves, ticks, splits, others = sort_moves(rest.values)
+    sizes, dates = np.abs(moves), grid.dates[rest.head :]
 
     def spot(i: int, j: int) -> dict[str, Any]:
         return grid.spot(grid.prices, rest.head + i, int(rest.assets[j]))
@@ -60,7 +81,6 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
             advice="Check the units of both prices.", **spot(i + 1, j),
         )  # fmt: skip
     findings.others("error", len(wild), "price", " that change by such factors")
-    ticks, splits, others = _sort_out(logs, moves, _jumps(values, moves, sizes))
 
     def warn(jumps: Iterable[Jump], say: Callable[[Jump], tuple[str, str]], *rest: str) -> None:
         """Warnings on the latest of some jumps, and the number of the others."""

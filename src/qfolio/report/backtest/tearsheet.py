@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.arrays import Floats
-from qfolio.core.text import plural
+from qfolio.core.text import amount, plural
 from qfolio.portfolio.backtest.folds import spell
 from qfolio.portfolio.backtest.statistics.measures import before_costs
 from qfolio.portfolio.backtest.statistics.tearsheet import (
@@ -214,6 +214,7 @@ def _histogram(
     reach = float(edges[-1])
     axis = Axis(-reach, reach)
     var, cvar = found["var"], found["cvar"]
+    known = not math.isnan(var)
     return {
         "bars": [
             (round(i * width, 3), round(100 * height / highest, 2))
@@ -223,9 +224,11 @@ def _histogram(
         "outline": " ".join(steps),
         "reach": percent(reach),
         "highest": percent(highest / 100, 0),
-        "marks": [(axis.at(-cvar), "CVaR"), (axis.at(-var), "VaR")],
+        "marks": [(axis.at(-cvar), "CVaR"), (axis.at(-var), "VaR")] if known else [],
         "label": f"95% of the returns are above {percent(-var, 2)}; "
-        f"the mean of the others is {percent(-cvar, 2)}",
+        f"the mean of the others is {percent(-cvar, 2)}"
+        if known
+        else f"{amount(returns.shape[-1], 'return')}, too few for a value at risk",
     }
 
 

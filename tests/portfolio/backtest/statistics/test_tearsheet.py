@@ -151,3 +151,10 @@ def test_a_record_without_losses_or_moves() -> None:
     assert found["longest"] == found["drawdown"] == found["hit_rate"] == found["omega"] == 0
     assert figures([0.1, 0.1], DAYS[:2], 252)["omega"] == math.inf
     assert figures([0.1, -1.0], DAYS[:2], 252)["growth"] == -1
+
+
+def test_tails_of_months_are_those_of_monthly_rows() -> None:
+    returns = np.random.default_rng(0).normal(0.01, 0.05, 30)
+    months = np.datetime64("2020-01-31") + np.arange(30) * 31
+    found = figures(returns, months, 12)
+    assert (found["var_month"], found["cvar_month"]) == pytest.approx(value_at_risk(returns))
