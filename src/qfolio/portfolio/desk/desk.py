@@ -229,10 +229,8 @@ class Desk:
         killed, the orders are those before it until there is a record, and the same allocation made
         again writes its own. A policy may have been updated in both cases; it is followed then.
 
-        Args:
-            agent, holdings, capital, anyway, whole_shares, as_of, update, orders, layout, currency,
-                dry_run: As the options of ``qfolio allocate``.
-            prices: Anything that ``qfolio.load_prices`` reads (default: those of the backtest).
+        The arguments are the options of ``qfolio allocate``, but ``prices`` may be anything that
+        ``qfolio.load_prices`` reads (default: those of the backtest).
 
         Raises:
             QfolioError: The backtest advises against the agent, an input does not fit, the last
