@@ -349,7 +349,7 @@ def test_resuming_gives_the_same(finished, tmp_path, stop):
 
 
 @pytest.mark.slow
-def test_on_workers_it_is_the_same(tmp_path):
+def test_on_workers_it_is_the_same(tmp_path, one_core):
     """Also for an agent that diverges, and for one whose seeds were trained in part."""
     rates, made = {"slow": 1e-3, "wild": 1e29, "quick": 1e-2}, list[Comparison]()
     for name in ("here", "stopped"):
@@ -375,9 +375,7 @@ def test_on_workers_it_is_the_same(tmp_path):
     assert resumed.finish()["ranking"]["order"] == here.finish()["ranking"]["order"]
 
 
-def test_what_workers_began_goes_on_here_in_the_same_log(tmp_path, monkeypatch):
-    monkeypatch.setenv("QFOLIO_CORES", "1")  # a seed at a time
-
+def test_what_workers_began_goes_on_here_in_the_same_log(tmp_path, one_core):
     def stop_in_the_second(job, done, share):
         return [Interrupt()] if job.name == "slow/1" else []
 

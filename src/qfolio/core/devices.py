@@ -39,12 +39,6 @@ UNROLLED = 16
 looks for vector instructions, and then finds none: without this limit, an operation on a row of 20
 numbers takes longer than on one of 64, and programs take longer to compile."""
 
-FEWEST = 2
-"""Devices of a CPU, and slots of each, so that a result does not depend on their number."""
-
-CORES = "QFOLIO_CORES"
-"""Environment variable with the number of cores that a process uses, if not all that it may."""
-
 TRACING = Lock()
 """Held while a program is traced. Tracing is done in Python, where two threads slow each other. In
 turn, the second traces while the first compiles."""
@@ -73,7 +67,7 @@ def configure() -> None:
         f"xla_cpu_small_while_loop_byte_threshold={SMALL_LOOP},-unroll-full-max-count={UNROLLED}"
     )
     wanted = {
-        "--xla_force_host_platform_device_count": str(of_cores(len(cores()))),
+        "--xla_force_host_platform_device_count": str(len(cores())),
         "--xla_cpu_multi_thread_eigen": "false",
         "--xla_backend_extra_options": loops,
     }
@@ -103,19 +97,6 @@ def cores() -> list[int]:
     return sorted(os.sched_getaffinity(0)) if known else list(range(os.cpu_count() or 1))
 
 
-def of_cores(cores: int) -> int:
-    """The number of devices that stand for some cores of a CPU."""
-    return max(FEWEST, cores)
-
-
-def in_use() -> int:
-    """How many devices compute at once: on a CPU, as many as this process uses cores."""
-    there = len(jax.devices())
-    if jax.devices()[0].platform in LOCKSTEP:
-        return there
-    return min(there, int(os.environ.get(CORES) or len(cores())))
-
-
 def describe() -> str:
     """The number, kind and platform of the devices.
 
@@ -130,7 +111,7 @@ def describe() -> str:
             f"jax finds no device of JAX_PLATFORMS={platforms}; unset it, or install jax for this "
             "platform."
         ) from None
-    return f"{in_use()} × {devices[0].device_kind} ({devices[0].platform})"
+    return f"{len(devices)} × {devices[0].device_kind} ({devices[0].platform})"
 
 
 def circumstances(*programs: str) -> dict[str, Any]:
@@ -183,16 +164,15 @@ class Members:
     def __init__(self, count: int, room: int = 0) -> None:
         self.room = max(count, room)
         self.one_by_one = jax.devices()[0].platform not in LOCKSTEP
-        # At least two devices, and two slots on each, if members take turns: XLA neither divides a
-        # program for one device nor keeps an axis of length one, and then rounds differently. An
-        # empty slot costs memory, but no time.
-        least = FEWEST if self.one_by_one else 1
-        used = min(in_use(), self.room)
-        devices = jax.devices()[: max(least, used)]
-        slots = max(least, -(-self.room // used))
+        # At least two devices, if there are two, and two slots on each if members take turns: XLA
+        # neither divides a program for one device nor keeps an axis of length one, and then rounds
+        # differently. An empty slot costs memory, but no time.
+        least = 2 if self.one_by_one else 1
+        devices = jax.devices()[: max(least, self.room)]
+        slots = max(least, -(-self.room // len(devices)))
         self.slots = slots * len(devices)
         self.form = (slots, len(devices), self.one_by_one)
-        shares = [*np.array_split(np.arange(count), used), *[np.arange(0)] * (len(devices) - used)]
+        shares = np.array_split(np.arange(count), len(devices))
         self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
         self._filling = np.concatenate([np.resize(share, slots) for share in shares])
         self._sharding = NamedSharding(

@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 
-from qfolio.core.devices import LOCKSTEP, in_use
+from qfolio.core.devices import LOCKSTEP
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
@@ -77,7 +77,7 @@ class Here:
 
     @property
     def devices(self) -> int:
-        return in_use()
+        return len(jax.devices())
 
     @property
     def lockstep(self) -> bool:

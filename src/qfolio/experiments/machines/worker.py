@@ -36,13 +36,10 @@ def prepare(environment: Mapping[str, str]) -> Ready:
 
 def environment(cores: int) -> dict[str, str]:
     """This process's settings of XLA and jax, adapted to a worker with ``cores`` cores."""
-    from qfolio.core.devices import CORES, of_cores
-
-    count = str(of_cores(cores))
     flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if _COUNT not in flag]
-    adapted = {CORES: str(cores), "XLA_FLAGS": " ".join([*flags, f"{_COUNT}={count}"])}
+    adapted = {"XLA_FLAGS": " ".join([*flags, f"{_COUNT}={cores}"])}
     if _CPUS in os.environ:  # it would take the place of the flag
-        adapted[_CPUS] = count
+        adapted[_CPUS] = str(cores)
     return adapted
 
 
