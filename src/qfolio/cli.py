@@ -7,9 +7,9 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import Any, NoReturn
 
-from qfolio.core.text import near, plain_signs, printable
+from qfolio.core.text import discard, near, plain_signs, printable
 from qfolio.core.version import __version__
 from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 
@@ -81,12 +81,12 @@ def run() -> NoReturn:
         finally:
             sys.stdout.flush()  # here, where a broken pipe is expected
     except BrokenPipeError:  # such as: qfolio prices table.csv | head
-        _discard(sys.stdout)
+        discard(sys.stdout)
     except Exception as error:
         try:
             sys.stdout.flush()
         except OSError:  # the output is what failed, as on a full disk
-            _discard(sys.stdout)
+            discard(sys.stdout)
             if isinstance(error, OSError) and not error.filename:
                 error.filename = "standard output"
         if (sentence := told(error)) is None:
@@ -176,14 +176,9 @@ def _named(text: str) -> Callable[[], None]:
     return command
 
 
-def _discard(stream: TextIO) -> None:
-    """Lets the rest of a stream go nowhere."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
 def _say(sentence: str) -> None:
     """Writes to the standard error, if it can be written."""
     try:
         print(f"qfolio: {printable(sentence)}", file=sys.stderr, flush=True)
     except OSError:
-        _discard(sys.stderr)
+        discard(sys.stderr)

@@ -1,6 +1,5 @@
 """Commands of the desk: compute tomorrow's trades, and follow the ledger of past allocations."""
 
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from qfolio.commands.arguments import File, Modules, Name, prepare
 from qfolio.commands.parsing import Document
 from qfolio.commands.tables import LATEST, ReadLatest, Returns
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import discard
 
 if TYPE_CHECKING:
     from qfolio.portfolio.desk.desk import Desk
@@ -229,7 +229,7 @@ def _telling(done: str) -> Iterator[None]:
     except OSError as error:
         if not done:
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to print
+        discard(sys.stdout)  # what is left to print
         said = f"The allocation cannot be printed ({error.strerror or error}). {done}"
         print(f"qfolio: {said}", file=sys.stderr)
         sys.exit(UNPRINTED)

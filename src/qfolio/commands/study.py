@@ -86,9 +86,9 @@ def study(
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1
             console.say(f"{place} of {len(run.places)}: {table}, {variant.text}")
-            first = variant == run.config.variants[0]  # they are the same for all of a table
-            for note in beforehand(backtest.config.agents, backtest.replay) if first else ():
-                console.tell(note)
+            if variant == run.config.variants[0]:  # the notes of a table's others are the same
+                for note in beforehand(backtest.config.agents, backtest.replay):
+                    console.tell(note)
             return JobsProgress(update)
 
         run.run(listen, write_page, executor)

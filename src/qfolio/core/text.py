@@ -1,4 +1,4 @@
-"""Text and values made safe for messages, the terminal, CSV cells and JSON."""
+"""Text and values made safe for messages, the terminal and its streams, CSV cells and JSON."""
 
 import difflib
 import math
@@ -9,7 +9,7 @@ import subprocess
 import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 UNSAFE = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
 """Unicode categories that a terminal may obey instead of showing: control, format (which may
@@ -40,6 +40,11 @@ def plain_signs(error: UnicodeError) -> tuple[str, int]:
         raise error
     lacking = error.object[error.start : error.end]
     return "".join(PLAIN.get(c, "?") for c in lacking), error.end
+
+
+def discard(stream: TextIO) -> None:
+    """Lets the rest of what a stream is given go nowhere, as when its reader has gone."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def quote(value: object, limit: int = 60) -> str:

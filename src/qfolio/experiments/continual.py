@@ -84,8 +84,7 @@ class Plan:
             raise QfolioError(
                 "nothing changes; give one of the task's numbers a new value, as in mass=2."
             )
-        for name in ("final", "steps"):
-            _setting(self.agent, name)
+        _require_schedule(self.agent)
         if any(task.optimum() is None for task in (self.task, self.changed)):
             raise QfolioError(
                 f"recovery is measured against an exact optimum, but {type(self.task).__name__} "
@@ -118,14 +117,14 @@ class Plan:
         return dataclasses.replace(agent, **changes)
 
 
-def _setting(agent: Agent, name: str) -> float:
-    value = getattr(agent, f"learning_rate_{name}", None)
-    if not isinstance(value, float):
+def _require_schedule(agent: Agent) -> None:
+    """Raises QfolioError for an agent whose learning rate has no schedule."""
+    found = (getattr(agent, f"learning_rate_{name}", None) for name in ("final", "steps"))
+    if not all(isinstance(value, float) for value in found):
         raise QfolioError(
             f"{type(agent).__name__} has no learning-rate schedule, which continuing requires; use "
             "an agent with a network, such as dqn."
         )
-    return value
 
 
 def _numbers(task: Task) -> list[str]:
