@@ -15,7 +15,6 @@ from populations import assert_same
 from shell import TINY, qfolio
 
 EPISODES, SEEDS = 12, 3
-pytestmark = pytest.mark.usefixtures("one_core")
 
 
 def start(task, agent, out=None, **changes):
@@ -75,7 +74,8 @@ def test_a_worker_with_several_devices_gets_as_many_seeds(task, agent):
 
 
 @pytest.mark.parametrize("folder", [True, False])
-def test_a_stopped_run_asks_for_what_is_missing(task, agent, tmp_path, folder):
+def test_a_stopped_run_asks_for_what_is_missing(task, agent, tmp_path, folder, monkeypatch):
+    monkeypatch.setenv("NPROC", "1")  # a seed at a time
     run = start(task, agent, tmp_path / "run" if folder else None)
     run.train(executor=Elsewhere(), listen=lambda job, *_: [Interrupt()] * (job.name == "dqn/1"))
     assert run.interrupted

@@ -444,9 +444,8 @@ def test_processes_share_a_search(tmp_path, task, agent):
         assert not ask(mine)
 
 
-def test_on_workers_a_search_is_the_same(tmp_path, task, agent, monkeypatch):
+def test_on_workers_a_search_is_the_same(tmp_path, task, agent):
     """A configuration is a job there; what is proposed next follows from all of a batch."""
-    monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
     here, there = (start(tmp_path / name, task, agent) for name in ("here", "there"))
     here.run()
     elsewhere, shares = Elsewhere(), list[float]()

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
 from jax.tree_util import keystr
 from jaxtyping import PRNGKeyArray, PyTree
 
@@ -87,7 +86,7 @@ def require_agent(
     stored = _shapes(agent, "observe", state, rollout)
     _require_like(agent, "observe", stored, state, like="init")
     _require_like(agent, "cut", _shapes(agent, "cut", state), state, like="init")
-    learned = jax.eval_shape(learning_of(task, agent), task, agent, *_here((state, rollout)), key)
+    learned = jax.eval_shape(learning_of(task, agent), task, agent, state, rollout, key)
     if not (isinstance(learned, tuple) and len(learned) == 2):
         raise _refused(agent, "learn", learned, "the next state, and a dict of metrics")
     _require_like(agent, "learn", learned[0], state, " as state", "init")
@@ -116,8 +115,7 @@ def learning_of(task: Task, agent: Agent) -> Callable[..., Any]:
     """``agent.learn`` as a function of task, agent, state, rollout and key.
 
     Tracing it takes most of the time that a program takes to trace. ``require_agent`` and the
-    program that trains share one trace, if the types of the arguments agree. A constant has another
-    type there than what is computed from arguments, see ``_here``.
+    program that trains share one trace, if the types of the arguments agree.
     """
     return _learning_of(jax.tree.structure((task, agent)), task.referents)
 
@@ -128,16 +126,6 @@ def _learning_of(_structure: Hashable, _referents: Hashable) -> Callable[..., An
         return _arrays(agent, "learn", agent.learn(task, state, rollout, key))
 
     return jax.jit(learn, inline=True)
-
-
-def _here(tree: PyTree) -> Any:
-    """Shapes and types as arrays have them that the program being traced computes.
-
-    In a program for several devices, the types of such arrays also say where they are.
-    """
-    mesh = jax.sharding.get_abstract_mesh()
-    place = None if mesh.empty else NamedSharding(mesh, PartitionSpec())
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), tree)
 
 
 def _form(actions: Actions) -> Any:

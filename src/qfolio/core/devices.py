@@ -1,15 +1,19 @@
 """JAX setup, and the placement of a population's members on devices.
 
 A population is a pytree whose leaves have a leading member axis: one member for each seed (or
-configuration), spread over the devices. A GPU steps its members in lockstep (vmap). On a CPU each
-core is a separate device and runs its members one after another: an agent's weights stay in cache,
-its matrix products keep their shape, and its arithmetic does not depend on the number of members,
-to the last bit.
+configuration). Its members are divided among places: the GPUs, or the cores of the CPU. A GPU steps
+its members in lockstep (vmap). On a CPU each core runs its members one after another: an agent's
+weights stay in cache, its matrix products keep their shape, and its arithmetic does not depend on
+the number of members, to the last bit. All cores run one program, compiled for one device, so that
+it does not depend on the number of cores either; XLA would compile a program for several devices in
+another way.
 """
 
 import datetime
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
 from importlib.metadata import version
 from platform import python_version
 from threading import Lock
@@ -19,11 +23,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import SingleDeviceSharding
+from jax.stages import Compiled
 from jaxtyping import Array
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import cache_directory, can_write
+from qfolio.core.products import register
 
 LOCKSTEP = {"gpu", "tpu"}
 """Platforms that step their members in lockstep."""
@@ -52,7 +58,7 @@ the compiler instead of a flag, because a version that does not know a flag ends
 
 
 def configure() -> None:
-    """Makes each core a device, compiles for speed, multiplies precisely, keeps programs on disk.
+    """Compiles for speed, multiplies precisely and alike on all cores, keeps programs on disk.
 
     Has an effect only before jax first computes; settings that the user has made are kept. Raises
     QfolioError if one of them is for double precision.
@@ -67,7 +73,6 @@ def configure() -> None:
         f"xla_cpu_small_while_loop_byte_threshold={SMALL_LOOP},-unroll-full-max-count={UNROLLED}"
     )
     wanted = {
-        "--xla_force_host_platform_device_count": str(len(cores())),
         "--xla_cpu_multi_thread_eigen": "false",
         "--xla_backend_extra_options": loops,
     }
@@ -76,6 +81,7 @@ def configure() -> None:
     if not jax.config.jax_default_matmul_precision:  # type: ignore[attr-defined]
         # GPUs would round the factors to three digits. CPUs compute as before.
         jax.config.update("jax_default_matmul_precision", "highest")
+    register()
     programs = cache_directory() / "programs"
     # Where nothing can be written, jax would warn in each run.
     if not jax.config.jax_compilation_cache_dir and can_write(programs):  # type: ignore[attr-defined]
@@ -97,13 +103,26 @@ def cores() -> list[int]:
     return sorted(os.sched_getaffinity(0)) if known else list(range(os.cpu_count() or 1))
 
 
+def places() -> list[jax.Device]:
+    """Where members are trained side by side: each GPU, or the CPU once for each of its cores.
+
+    NPROC, which bounds XLA's own threads, bounds the number of cores, too.
+    """
+    devices = jax.devices()
+    if devices[0].platform in LOCKSTEP:
+        return devices
+    limit = os.environ.get("NPROC", "")
+    count = len(cores())
+    return devices[:1] * (min(count, max(1, int(limit))) if limit.isdigit() else count)
+
+
 def describe() -> str:
-    """The number, kind and platform of the devices.
+    """The number of places, and kind and platform of their devices.
 
     Raises QfolioError if the platform that the user chose has none.
     """
     try:
-        devices = jax.devices()
+        devices = places()
     except (AssertionError, RuntimeError):  # the first without the plugin of a platform
         if not (platforms := os.environ.get("JAX_PLATFORMS")):
             raise
@@ -148,51 +167,69 @@ def require_memory(tree: Any, count: int) -> None:
         )
 
 
+class Program:
+    """A program compiled once for each device on which it runs; its results are those of a call."""
+
+    def __init__(self, compile: Callable[[jax.Device], Compiled], first: jax.Device) -> None:
+        self._compile, self._lock = compile, Lock()
+        self._on = {first: compile(first)}
+
+    def on(self, device: jax.Device) -> Compiled:
+        with self._lock:
+            if device not in self._on:
+                self._on[device] = self._compile(device)
+            return self._on[device]
+
+    @property
+    def shapes(self) -> Any:
+        """Shapes and types of what it computes in one place."""
+        return next(iter(self._on.values())).out_info
+
+
 class Members:
-    """``count`` members spread over the devices, each in a slot of its device.
+    """``count`` members divided among places, each in a slot of its place.
 
     room: number of members to provide slots for, if more than ``count``.
-    one_by_one: whether a device runs its members in turn instead of in lockstep.
+    one_by_one: whether a place runs its members in turn instead of in lockstep.
     form: everything that compiled programs depend on.
-    slots: number of slots of all devices.
-    taken: number of taken slots of each device, the first argument of compiled programs.
+    slots: number of slots of all places.
 
-    Outside, leaves have a leading axis of length ``count``; on the devices, an axis of slots.
-    ``place`` and ``fetch`` convert between the two.
+    Outside, leaves have a leading axis of length ``count``. On the devices there is a tree for each
+    place, whose leaves have an axis of slots. ``place`` and ``fetch`` convert between the two.
     """
 
     def __init__(self, count: int, room: int = 0) -> None:
-        self.room = max(count, room)
+        room = max(count, room)
         self.one_by_one = jax.devices()[0].platform not in LOCKSTEP
-        # At least two devices, if there are two, and two slots on each if members take turns: XLA
-        # neither divides a program for one device nor keeps an axis of length one, and then rounds
-        # differently. An empty slot costs memory, but no time.
-        least = 2 if self.one_by_one else 1
-        devices = jax.devices()[: max(least, self.room)]
-        slots = max(least, -(-self.room // len(devices)))
-        self.slots = slots * len(devices)
-        self.form = (slots, len(devices), self.one_by_one)
-        shares = np.array_split(np.arange(count), len(devices))
-        self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
-        self._filling = np.concatenate([np.resize(share, slots) for share in shares])
-        self._sharding = NamedSharding(
-            jax.sharding.Mesh(np.array(devices), ("member",)), PartitionSpec("member")
-        )
-        taken = np.array([len(share) for share in shares], np.int32)
-        self.taken = jax.device_put(taken, self._sharding)
+        self._places = places()[:room]
+        # At least two slots if members take turns: XLA does not keep an axis of length one, and
+        # then rounds differently. An empty slot costs memory, but no time.
+        slots = max(2 if self.one_by_one else 1, -(-room // len(self._places)))
+        self.slots = slots * len(self._places)
+        self.form = (slots, self.one_by_one)
+        self._shares = np.array_split(np.arange(count), len(self._places))
 
-    def place(self, tree: Any) -> Any:
-        """Moves leaves with a leading member axis to the devices."""
-        slots = jax.tree.map(lambda x: np.asarray(x)[self._filling], tree)
-        # Programs return empty arrays undivided, and take them back only like this.
-        undivided = NamedSharding(self._sharding.mesh, PartitionSpec())
-        return jax.device_put(
-            slots, jax.tree.map(lambda x: self._sharding if x.size else undivided, slots)
-        )
+    def place(self, tree: Any) -> list[Any]:
+        """Moves leaves with a leading member axis to the places; empty slots repeat a member."""
+        filling = [np.resize(share, self.form[0]) for share in self._shares]
+        return [
+            jax.device_put(jax.tree.map(lambda x, at=at: np.asarray(x)[at], tree), device)
+            for at, device in zip(filling, self._places, strict=True)
+        ]
 
-    def fetch(self, tree: Any) -> Any:
-        """Leaves on the devices, as numpy arrays with a leading member axis."""
-        return jax.tree.map(lambda x: unkeyed(x)[self._slots], tree)
+    def share(self, tree: Any) -> list[Any]:
+        """What all members have in common, at each place; places of one device share its memory."""
+        there = {device: jax.device_put(tree, device) for device in dict.fromkeys(self._places)}
+        return [there[device] for device in self._places]
+
+    def fetch(self, trees: list[Any]) -> Any:
+        """What is at the places, as numpy arrays with a leading member axis."""
+        taken = [len(share) for share in self._shares]
+
+        def joined(*leaves: Any) -> np.ndarray:
+            return np.concatenate([unkeyed(x)[:n] for x, n in zip(leaves, taken, strict=True)])
+
+        return jax.tree.map(joined, *trees)
 
     def compile(
         self,
@@ -201,40 +238,61 @@ class Members:
         split: int = 1,
         donate: bool = False,
         once: bool = False,
-    ) -> Any:
-        """Compiles ``function(*members, *shared)`` into a program of ``taken`` and these arguments.
+    ) -> Program:
+        """Compiles ``function(*members, *shared)`` into a program for ``run``.
 
-        It serves all populations of the same form, whatever their number of members.
+        It serves all populations of the same form, whatever their number of members and places.
 
-        example: arguments of the shapes to compile for; the first ``split`` of them have an axis of
-        slots, the others are the same for all members. donate: reuses the first one's memory.
-        once: whether it is to run only once, so that optimizing it would take longer than it saves.
+        example: arguments of one place, of the shapes to compile for; the first ``split`` of them
+        have an axis of slots, the others are the same for all members. donate: reuses the first
+        one's memory. once: whether it is to run only once, so that optimizing it would take longer
+        than it saves.
         """
+        shapes = jax.eval_shape(lambda *args: args, *example)
 
-        def on_device(taken: Array, *args: Any) -> Any:
+        def in_place(taken: Array, *args: Any) -> Any:
             one = lambda members: function(*members, *args[split:])  # noqa: E731
             members = args[:split]
-            return _map(one, members, taken[0]) if self.one_by_one else jax.vmap(one)(members)
+            return _map(one, members, taken) if self.one_by_one else jax.vmap(one)(members)
 
-        def on_all(taken: Array, *args: Any) -> Any:
-            each, same = self._sharding.spec, PartitionSpec()
-            return jax.shard_map(
-                on_device,
-                mesh=self._sharding.mesh,
-                in_specs=(each, *[each] * split, *[same] * (len(args) - split)),
-                out_specs=each,
-                check_vma=False,
-            )(taken, *args)
+        program = jax.jit(in_place, donate_argnums=1 if donate else ())
 
-        program = jax.jit(on_all, donate_argnums=1 if donate else ())
-        with TRACING:
-            lowered = program.lower(self.taken, *example)
-        try:
-            return lowered.compile(compiler_options=PRODUCTS_ONLY | effort(once=once))
-        except jax.errors.JaxRuntimeError as error:
-            if "INVALID_ARGUMENT" not in str(error):
-                raise
-            return lowered.compile()  # this version of XLA has no such option
+        def compile(device: jax.Device) -> Compiled:
+            sharding = SingleDeviceSharding(device)
+            there = jax.tree.map(lambda x: x.update(sharding=sharding), shapes)
+            with TRACING:
+                lowered = program.lower(np.int32(0), *there)
+            try:
+                return lowered.compile(compiler_options=PRODUCTS_ONLY | effort(once=once))
+            except jax.errors.JaxRuntimeError as error:
+                if "INVALID_ARGUMENT" not in str(error):
+                    raise
+                return lowered.compile()  # this version of XLA has no such option
+
+        return Program(compile, self._places[0])
+
+    def run(self, program: Program, *args: list[Any]) -> list[Any]:
+        """What the program computes at each place, from arguments that have a tree for each.
+
+        The places work side by side, each in a thread: jax runs what one thread starts on the CPU
+        one after another.
+        """
+
+        def call(place: int) -> Any:
+            start = program.on(self._places[place])
+            taken = np.int32(len(self._shares[place]))
+            return jax.block_until_ready(start(taken, *(arg[place] for arg in args)))
+
+        if len(self._places) == 1:
+            return [call(0)]
+        under_way = [_threads().submit(call, place) for place in range(len(self._places))]
+        wait(under_way)  # all of them, even if one fails
+        return [each.result() for each in under_way]
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(len(places()), "place")
 
 
 def unkeyed(leaf: Any) -> np.ndarray:

@@ -211,12 +211,13 @@ class HostPopulation(Population):
     starts, curve_starts = 100, 10
     task: HostTask
 
-    def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
+    def _begin(self, own: list[np.ndarray], shared: list[Any], form: Hashable) -> None:
         length = self.agent.rollout_steps
         self._rows = length * -(-CHUNK // length)
         self._programs = programs_of((form, "host", self._rows))
         self._require_memory()
         self._own = [jax.device_put([x[i] for x in own]) for i in range(len(self.seeds))]
+        self._shared = shared
         self._states = [
             self._start(
                 "begin", lambda task, agent, seed: begin(task, agent, seed), seed, own, once=True

@@ -1,7 +1,7 @@
 """Members trained side by side in one compiled program, each one seed of one agent on one task."""
 
 from collections.abc import Callable, Hashable, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from threading import Lock
 from time import perf_counter
 from typing import Any
@@ -30,7 +30,6 @@ class Population:
     tasks, agents: one for all members, or one for each, differing in numbers and arrays only.
     seeds: one for each member.
     room: size of the largest population that shares these programs (default: this one's).
-    state: the members' TrainingState, with a leading member axis.
     starts, curve_starts: how many starts a final evaluation and the learning curve use.
 
     Raises QfolioError if the agents' settings need different programs, or memory is too small.
@@ -58,8 +57,8 @@ class Population:
         self.task, self.agent = tasks[0], agents[0]
         self._tail = max(tail_steps(agent.discount) for agent in agents)
         self.seconds_compile = 0.0
-        own, self._shared, self._join, form = _split(list(zip(tasks, agents, strict=True)))
-        self._begin(own, (form, self.task.referents))
+        own, shared, self._join, form = _split(list(zip(tasks, agents, strict=True)))
+        self._begin(own, shared, (form, self.task.referents))
 
     def _require_memory(self) -> None:
         """Raises QfolioError if memory is too small for a form that has not been run before."""
@@ -72,19 +71,19 @@ class Population:
         """How many members' states are in memory."""
         return self._members.slots
 
-    def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
-        """Sets up the members before their first step; ``own`` is from ``_split``.
+    def _begin(self, own: list[np.ndarray], shared: list[Any], form: Hashable) -> None:
+        """Sets up the members before their first step; ``own`` and ``shared`` are from ``_split``.
 
         form: everything about tasks and agents that a compiled program depends on.
         """
         self._members = Members(len(self.seeds), self._room)
-        self._own = self._members.place(own)
+        self._own, self._shared = self._members.place(own), self._members.share(shared)
         # The key holds everything that a compiled program depends on.
         rows = chunk_steps(self.task, self.agent)
         self._programs = programs_of((form, self._members.form, rows))
         self._require_memory()
         seeds = self._members.place(np.array(self.seeds, np.uint32))
-        self.state: TrainingState = self._run(
+        self._states: list[TrainingState] = self._run(
             "begin", lambda task, agent, seed: begin(task, agent, seed), seeds, once=True
         )
 
@@ -132,16 +131,16 @@ class Population:
         """Advances at most one chunk; returns records as numpy arrays (member, time, environment).
 
         steps: of each environment, rounded up to whole rollouts. strict: raises QfolioError if a
-        loss is not finite; ``state`` is of no use then. Without it, the other members continue, and
-        ``healthy`` shows which failed.
+        loss is not finite; its states are of no use then. Without it, the other members continue,
+        and ``healthy`` shows which failed.
         """
-        self.state, episodes = self._advance(*self._plan(steps, chunk_steps(self.task, self.agent)))
+        episodes = self._advance(*self._plan(steps, chunk_steps(self.task, self.agent)))
         if strict:
             self._require_healthy()
         return self._members.fetch(episodes)
 
-    def _advance(self, steps: int, learning: bool) -> tuple[TrainingState, Episodes]:
-        """The state after some steps and their records, both on the devices."""
+    def _advance(self, steps: int, learning: bool) -> list[Episodes]:
+        """Takes some steps; returns their records, still at the places."""
 
         def program(
             task: Task, agent: Agent, state: TrainingState, steps: Array
@@ -149,7 +148,9 @@ class Population:
             return advance(task, agent, state, steps, learning=learning)
 
         name = "learn" if learning else "collect"
-        return self._run(name, program, self.state, np.int32(steps), donate=True)
+        done = self._run(name, program, self._states, np.int32(steps), donate=True)
+        self._states = [state for state, _ in done]
+        return [episodes for _, episodes in done]
 
     @property
     def learning(self) -> bool:
@@ -204,7 +205,7 @@ class Population:
     def _member(self, member: int) -> tuple[Task, Agent]:
         """A member's task and agent."""
         own = jax.tree.map(lambda leaf: jnp.asarray(leaf[member]), self._members.fetch(self._own))
-        found: tuple[Task, Agent] = self._join(own, self._shared)
+        found: tuple[Task, Agent] = self._join(own, self._shared[0])
         return found
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
@@ -218,7 +219,7 @@ class Population:
         def program(task: Task, agent: Agent, weights: PyTree, keys: Array) -> Greedy:
             return evaluate(task, agent, weights, keys, tail)
 
-        weights = self.agent.weights(self.state.agent)
+        weights = [self.agent.weights(state.agent) for state in self._states]
         greedy = self._run(f"evaluate {len(keys)} {tail}", program, weights, keys)
         return self._members.fetch(greedy)
 
@@ -232,26 +233,27 @@ class Population:
 
     def restore(self, state: TrainingState) -> None:
         """Restores the states that ``fetch`` returned."""
-        self.state = keyed(self._members.place(state), self.state)
+        self._states = list(map(keyed, self._members.place(state), self._states))
 
     def _fetch(self, where: Callable[[TrainingState], PyTree]) -> PyTree:
         """Parts of the members' states as numpy arrays, with a leading member axis."""
-        return self._members.fetch(where(self.state))
+        return self._members.fetch([where(state) for state in self._states])
 
     def _run(
         self,
         name: str,
         function: Callable[..., Any],
-        members: Any,
+        members: list[Any],
         *args: Any,
         **how: bool,
-    ) -> Any:
-        """Runs ``function(task, agent, member, *args)`` for all members as one program.
+    ) -> list[Any]:
+        """Runs ``function(task, agent, member, *args)`` for all members, at all places.
 
-        how: to compile it, see ``Members.compile``.
+        members: a tree for each place. how: to compile it, see ``Members.compile``.
         """
-        start = partial(self._start, name, function, members, self._own)
-        return jax.block_until_ready(start(*args, **how))
+        same = [self._members.share(arg) for arg in args]
+        found: list[Any] = self._start(name, function, members, self._own, *same, **how)
+        return found
 
     def _start(
         self,
@@ -262,7 +264,7 @@ class Population:
         *args: Any,
         **how: bool,
     ) -> Any:
-        """``_run`` without waiting for the result; compiles at the first use of the name.
+        """Calls the program of this name, which is compiled when the name is first used.
 
         own: the numbers of the member's agent and task.
         """
@@ -283,11 +285,12 @@ class Population:
         self, one: Callable[..., Any], *args: Any, donate: bool = False, once: bool = False
     ) -> Any:
         """Compiles for arguments shaped like these."""
-        return self._members.compile(one, *args, split=2, donate=donate, once=once)
+        here = [arg[0] for arg in args]
+        return self._members.compile(one, *here, split=2, donate=donate, once=once)
 
     def _call(self, program: Any, *args: Any) -> Any:
         """Calls what ``_compile`` returned, for this or another population of the same form."""
-        return program(self._members.taken, *args)
+        return self._members.run(program, *args)
 
 
 class Rehearsal(Population):
@@ -299,8 +302,7 @@ class Rehearsal(Population):
             self._advance(0, learning)
 
     def _call(self, program: Any, *args: Any) -> Any:
-        shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding)  # noqa: E731
-        return jax.tree.map(shape, program.out_info)
+        return [program.shapes]
 
 
 class Programs(dict[str, Any]):

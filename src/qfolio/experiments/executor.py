@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 
-from qfolio.core.devices import LOCKSTEP
+from qfolio.core.devices import LOCKSTEP, places
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
@@ -53,7 +53,7 @@ class Executor(Protocol):
 
     @property
     def devices(self) -> int:
-        """Number of devices of one worker."""
+        """Number of devices of one worker: GPUs, or cores."""
         ...
 
     @property
@@ -77,7 +77,7 @@ class Here:
 
     @property
     def devices(self) -> int:
-        return len(jax.devices())
+        return len(places())
 
     @property
     def lockstep(self) -> bool:

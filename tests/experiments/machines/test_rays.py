@@ -250,7 +250,6 @@ class TestRay:
         resumed.train(executor=on("ray"), listen=listen)
         assert 0 < len(kept) < 4
         assert asked == {f"dqn/{seed}" for seed in range(4)} - {f"dqn/{seed}" for seed in kept}
-        monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
         alone = Run.create(task, agent, budget=budget, seeds=4)
         alone.train()
         jax.tree.map(

@@ -6,7 +6,6 @@ import itertools
 import multiprocessing
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
@@ -41,22 +40,10 @@ def files(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in kept}
 
 
-class OneCore(Here):
-    """This process, on the first of its cores: programs that are hardly optimized, as those of the
-    quick tests, round differently on two."""
-
-    devices = 1
-
-    def map(self, jobs, listen):
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
-            yield from super().map(jobs, listen)
-
-
 @pytest.fixture(scope="module")
 def here(tmp_path_factory):
     backtest = create(tmp_path_factory.mktemp("backtests") / "run")
-    backtest.run(executor=OneCore())
+    backtest.run()
     return files(backtest.folder)
 
 
@@ -99,9 +86,10 @@ def test_stopped_and_resumed_elsewhere(here, tmp_path):
         asked.append(job.name)
         return []
 
-    resumed.run(note, Processes(2, cores=1))
+    workers = Processes(2, cores=1)
+    resumed.run(note, workers)
     assert not resumed.interrupted
-    assert set(asked) == {job.name for job in create(None).jobs(OneCore())} - kept
+    assert set(asked) == {job.name for job in create(None).jobs(workers)} - kept
     assert files(tmp_path / "run") == here
 
 
@@ -125,7 +113,7 @@ def test_a_worker_that_is_killed(here, tmp_path):
     assert files(tmp_path / "run") == here
 
 
-@pytest.mark.optimized  # see OneCore
+@pytest.mark.optimized
 def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
     """Groups of folds differ with the cores of a worker; what is learned does not."""
     found: list[dict[str, bytes]] = []
@@ -154,7 +142,7 @@ def test_ray_equals_this_process(here, tmp_path):
 @pytest.mark.slow
 def test_a_study_on_processes(tmp_path):
     done: list[Any] = []
-    for executor in (OneCore(), Processes(2, cores=1)):
+    for executor in (Here(), Processes(2, cores=1)):
         study = Study.create(
             {"one": table(0), "two": table(1)}, AGENTS, out=tmp_path / f"{len(done)}",
             costs=(0.001, 0.005), train="80d", test="40d", seeds=2, baselines=[],

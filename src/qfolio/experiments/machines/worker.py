@@ -22,8 +22,6 @@ from qfolio.experiments.machines.messages import Done, Failed, Message, Ready, p
 if TYPE_CHECKING:
     from qfolio.experiments.machines.parcels import Parcel, Unpacker
 
-_COUNT, _CPUS = "--xla_force_host_platform_device_count", "JAX_NUM_CPU_DEVICES"
-
 
 def prepare(environment: Mapping[str, str]) -> Ready:
     """Sets jax up in a process in which nothing has imported it."""
@@ -35,12 +33,8 @@ def prepare(environment: Mapping[str, str]) -> Ready:
 
 
 def environment(cores: int) -> dict[str, str]:
-    """This process's settings of XLA and jax, adapted to a worker with ``cores`` cores."""
-    flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if _COUNT not in flag]
-    adapted = {"XLA_FLAGS": " ".join([*flags, f"{_COUNT}={cores}"])}
-    if _CPUS in os.environ:  # it would take the place of the flag
-        adapted[_CPUS] = str(cores)
-    return adapted
+    """This process's settings of XLA, for a worker with ``cores`` cores."""
+    return {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "NPROC": str(cores)}
 
 
 def work(unpacker: "Unpacker", parcel: "Parcel", send: Callable[[Message], None]) -> None:
