@@ -5,66 +5,74 @@ left factor, as the gradient of a layer's weights does. Such a product goes to E
 a long sum in as many parts as there are threads. So results would depend on the number of cores.
 """
 
-from collections.abc import Iterable
+from functools import cache
 from math import prod
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.mlir.dialects import stablehlo
+from jax.extend.core import Primitive
 from jax.interpreters import mlir
+from jaxtyping import Array
 
 SHORT = 64
 """Most terms of a sum that Eigen leaves whole. It is then faster than copying the factors."""
 
+PRODUCT, AS_IT_IS = lax.dot_general_p, Primitive("product_as_it_is")
 
+
+@cache
 def register() -> None:
     """Has jax arrange long products on a CPU as YNNPACK takes them."""
-    product = lax.dot_general_p
     try:
-        lower = mlir._platform_specific_lowerings["cpu"][product].rule
+        usual = mlir._platform_specific_lowerings["cpu"][PRODUCT].rule
     except (AttributeError, KeyError):  # a later jax; tests then show what depends on the cores
         return
+    arranged = mlir.lower_fun(_arranged, multiple_results=False)
 
-    def arranged(context: Any, *factors: Any, dimension_numbers: Any, **how: Any) -> Any:
-        kinds, (summed, _) = context.avals_in, dimension_numbers
-        long = prod(kinds[0].shape[i] for i in summed[0]) > SHORT
-        if not long or kinds[0].dtype != jnp.float32:
-            return lower(context, *factors, dimension_numbers=dimension_numbers, **how)
-        orders, numbers = _arrangement(kinds, dimension_numbers)
-        # The barriers keep XLA from moving transpositions into the product.
-        factors = tuple(_barred(map(stablehlo.transpose, factors, orders)))
-        kinds = [
-            kind.update(shape=tuple(kind.shape[i] for i in order))
-            for kind, order in zip(kinds, orders, strict=True)
-        ]
-        found = lower(context.replace(avals_in=kinds), *factors, dimension_numbers=numbers, **how)
-        if max(numbers[0][1]) == kinds[1].ndim - 1:
-            return found
-        # XLA would exchange the factors if the result were transposed.
-        return _barred(found)
+    def lower(context: Any, *factors: Any, **how: Any) -> Any:
+        rule = arranged if _is_long(context.avals_in[0], **how) else usual
+        return rule(context, *factors, **how)
 
-    mlir.register_lowering(product, arranged, platform="cpu")
+    mlir.register_lowering(AS_IT_IS, usual, platform="cpu")
+    mlir.register_lowering(PRODUCT, lower, platform="cpu")
 
 
-def _barred(values: Iterable[Any]) -> list[Any]:
-    return [stablehlo.OptimizationBarrierOp([value]).results[0] for value in values]
+@AS_IT_IS.def_abstract_eval
+def _kind(*factors: Any, **how: Any) -> jax.core.ShapedArray:
+    found = jax.eval_shape(lambda *factors: PRODUCT.bind(*factors, **how), *factors)
+    return jax.core.ShapedArray(found.shape, found.dtype)
 
 
-def _arrangement(factors: Any, numbers: Any) -> tuple[list[list[int]], Any]:
-    """The orders of the factors' axes, and their numbers then.
+def _is_long(left: Any, *, dimension_numbers: Any, **_: Any) -> bool:
+    (summed, _), _ = dimension_numbers
+    return left.dtype == jnp.float32 and prod(left.shape[i] for i in summed) > SHORT
 
-    If the left factor does not sum over its last axes, both are made to: then XLA may exchange
-    them, as it does for the gradient of weights.
+
+def _arranged(*factors: Array, dimension_numbers: Any, **how: Any) -> Array:
+    """The product of factors as YNNPACK takes them, however XLA may turn them.
+
+    XLA moves transpositions into a product, from which barriers keep it. It exchanges the factors
+    if the result is transposed, as for the gradient of weights. If the left factor has to be
+    transposed, both are therefore made to sum over their last axis.
     """
-    summed, batch = numbers
-    ordered = [
+    summed, batch = dimension_numbers
+    count = len(batch[0])
+    orders = [
         [*ours, *(i for i in range(x.ndim) if i not in {*ours, *sums}), *sums]
         for x, sums, ours in zip(factors, summed, batch, strict=True)
     ]
-    same = [list(range(x.ndim)) for x in factors]
-    if ordered[0] == same[0]:
-        return same, numbers
-    first = tuple(range(len(batch[0])))
-    last = [tuple(range(x.ndim - len(summed[0]), x.ndim)) for x in factors]
-    return ordered, (tuple(last), (first, first))
+    if orders[0] == list(range(len(orders[0]))):
+        barred = map(lax.optimization_barrier, factors)
+        found = AS_IT_IS.bind(*barred, dimension_numbers=dimension_numbers, **how)
+        return found if max(summed[1]) == len(orders[1]) - 1 else lax.optimization_barrier(found)
+    rests, matrices = [], []
+    for factor, order in zip(factors, orders, strict=True):
+        factor = lax.transpose(factor, order)
+        ours, rest = factor.shape[:count], factor.shape[count : factor.ndim - len(summed[0])]
+        rests.append(rest)
+        matrices.append(lax.optimization_barrier(factor.reshape(*ours, prod(rest), -1)))
+    numbers = (((count + 1,), (count + 1,)), (tuple(range(count)),) * 2)
+    found = AS_IT_IS.bind(*matrices, dimension_numbers=numbers, **how)
+    return found.reshape(*found.shape[:count], *rests[0], *rests[1])

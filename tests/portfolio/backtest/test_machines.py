@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.registry import trust
+from qfolio.experiments import presets
 from qfolio.experiments.executor import Here
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.machines.choice import on
@@ -116,9 +117,15 @@ def test_a_worker_that_is_killed(here, tmp_path):
 @pytest.mark.optimized
 def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
     """Groups of folds differ with the cores of a worker; what is learned does not."""
+    prices = price_table(random_walk(700, 12, 0, drift=3e-4), [f"A{i}" for i in range(12)])
+    agents = {name: presets.preset("fast", "portfolio", name) for name in ("tilts", "sac")}
+    agents = {name: preset._replace(episodes=96) for name, preset in agents.items()}
     found: list[dict[str, bytes]] = []
     for executor in (Here(), Processes(1), Processes(2, cores=1)):
-        backtest = create(tmp_path / f"{len(found)}", AGENTS | {"dqn": DQN})
+        backtest = Backtest.create(
+            prices, agents | {"dqn": DQN}, train="500d", test="100d", seeds=2,
+            out=tmp_path / f"{len(found)}",
+        )  # fmt: skip
         backtest.run(executor=executor)
         found.append(files(backtest.folder))
     assert found[0] == found[1] == found[2]
