@@ -1,5 +1,6 @@
 """What is asked of jax before it computes."""
 
+import ast
 import os
 import subprocess
 import sys
@@ -84,3 +85,30 @@ def test_memory_counts_every_slot(monkeypatch):
     monkeypatch.setattr(devices, "host_memory", lambda: 2**20)
     with pytest.raises(QfolioError, match=r"need 0\.0 GiB"):
         devices.require_memory(state, members.slots)
+
+
+def test_gpus_divide_members_among_them(tmp_path):
+    """Two devices of the CPU stand for two GPUs."""
+    code = (
+        "import jax; from qfolio.core import devices; devices.LOCKSTEP = {'cpu'}\n"
+        "from qfolio import DQN; from qfolio.core.population import Population\n"
+        "from qfolio.tasks.pendulum import Pendulum\n"
+        "agent = DQN(hidden=(8,), batch_size=8, replay_capacity=99, learning_starts=9)\n"
+        "population = Population(Pendulum(horizon=9), agent, range(3))\n"
+        "population.advance(9); population.advance(9)\n"
+        "print([{x.device.id for x in jax.tree.leaves(s)} for s in population._states])\n"
+        "print([len(s.steps) for s in population._states])\n"
+        "print(population.fetch().agent.online.mlp.weights[0].sum((1, 2)).tolist())\n"
+    )
+    told = []
+    for count in (1, 2):
+        flags = f"--xla_force_host_platform_device_count={count}"
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True,
+            env=os.environ | {"XLA_FLAGS": flags},
+        )  # fmt: skip
+        told.append([ast.literal_eval(line) for line in done.stdout.splitlines()])
+    alone, two = told
+    assert alone[:2] == [[{0}], [3]]
+    assert two[:2] == [[{0}, {1}], [2, 2]]
+    assert two[2] == pytest.approx(alone[2], abs=1e-5)
