@@ -2,8 +2,11 @@
 
 import ast
 import os
+import signal
 import subprocess
 import sys
+import threading
+import time
 
 import jax
 import pytest
@@ -112,3 +115,26 @@ def test_gpus_divide_members_among_them(tmp_path):
     assert alone[:2] == [[{0}], [3]]
     assert two[:2] == [[{0}, {1}], [2, 2]]
     assert two[2] == pytest.approx(alone[2], abs=1e-5)
+
+
+def test_all_places_end_before_ctrl_c_does():
+    """And before an exception of one of them: their threads would be inside jax."""
+    ended = list[int]()
+
+    def call(place):
+        time.sleep(0.2 * place)
+        ended.append(place)
+        if place == 1:
+            raise ValueError("one")
+
+    with pytest.raises(ValueError, match="one"):
+        devices.side_by_side(call, 3)
+    assert ended == [0, 1, 2]
+    ended.clear()
+    main = threading.main_thread().ident
+    assert main is not None
+    threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        devices.side_by_side(call, 3)
+    assert ended == [0, 1, 2]
+    assert devices.side_by_side(lambda place: place, 1) == [0]

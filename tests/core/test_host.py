@@ -3,6 +3,8 @@
 import dataclasses
 import gc
 import json
+import os
+import subprocess
 import sys
 from typing import Any
 
@@ -630,3 +632,24 @@ def test_actions_with_bounds_are_learned(task, returns):
     run = Run.create(GymnasiumTask(**preset.task), preset.build(), seeds=1, seed=100, steps=third)
     run.train()
     assert run.grade()["return_per_seed"][0] > returns
+
+
+def test_training_does_not_depend_on_the_number_of_threads():
+    code = (
+        "import hashlib, jax; from qfolio import DQN; from qfolio.core.host import HostPopulation\n"
+        "from qfolio.tasks.gymnasium import GymnasiumTask\n"
+        "agent = DQN(hidden=(256,), batch_size=256, learning_starts=256, replay_capacity=999)\n"
+        "population = HostPopulation(GymnasiumTask('CartPole-v1'), agent, [0])\n"
+        "while population.steps < 320:\n"
+        "    population.advance(64)\n"
+        "weights = jax.tree.leaves(population.weights())\n"
+        "print(hashlib.sha256(b''.join(x.tobytes() for x in weights)).hexdigest())\n"
+    )
+    learned = {
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True,
+            env=os.environ | {"NPROC": threads, "XLA_FLAGS": ""},
+        ).stdout
+        for threads in ("1", "8")
+    }  # fmt: skip
+    assert len(learned) == 1

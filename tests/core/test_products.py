@@ -17,11 +17,11 @@ import jax, jax.numpy as jnp, numpy as np
 from qfolio.core import devices, products
 
 if {plain}:
-    products.register = devices.register = lambda: None
+    products.register = lambda: None
 devices.configure()
 rng = np.random.default_rng(0)
 factors = [rng.standard_normal((2048, n)).astype(np.float32) for n in (300, 4)]
-factors.append(rng.standard_normal((2, 2048, 4)).astype(np.float32))
+factors.append(rng.standard_normal((2, 2048, 32)).astype(np.float32))
 
 def loss(w, x, y):
     return (jnp.tanh(x @ w) * y).sum()
@@ -33,14 +33,10 @@ found = {{
     "turned before": lambda x, y, stack: x.T @ y,
     "turned after": lambda x, y, stack: (y.T @ x).T,
     "turned all": lambda x, y, stack: (jnp.tanh(x.T) @ y).T,
-    "batch": lambda x, y, stack: jnp.einsum("ki,bkj->bij", x, stack),
     "batch of both": lambda x, y, stack: jax.vmap(lambda u: u.T @ u)(stack),
-    "two sums": lambda x, y, stack: jnp.einsum("bki,bkj->ij", stack, stack),
-    "two sums, exchanged": lambda x, y, stack: jnp.einsum("bki,bkj->ji", stack, stack[..., :3]),
     "gradient of a stack": lambda x, y, stack: jax.grad(
         lambda w: jnp.tanh(stack @ w).sum()
-    )(jnp.ones((4, 3))),
-    "vector": lambda x, y, stack: x.T @ y[:, 0],
+    )(jnp.ones((32, 3)) / 32),
 }}
 for name, product in found.items():
     compiled = jax.jit(product).lower(*factors).compile(compiler_options=devices.PRODUCTS_ONLY)
@@ -59,7 +55,7 @@ def hashes(threads: int, *, plain: bool = False) -> dict[str, str]:
 
 def test_products_do_not_depend_on_the_number_of_threads():
     one = hashes(1)
-    assert len(one) == 12
+    assert len(one) == 8
     assert one == hashes(8)
 
 
@@ -67,8 +63,7 @@ def test_products_do_not_depend_on_the_number_of_threads():
 def test_products_would_depend_on_the_number_of_threads():
     """If this fails, products.py is no longer needed."""
     one, many = hashes(1, plain=True), hashes(8, plain=True)
-    assert one.keys() == many.keys()
-    assert one != many
+    assert [name for name in one if one[name] == many[name]] == []
 
 
 @pytest.mark.parametrize(
@@ -83,6 +78,8 @@ def test_products_would_depend_on_the_number_of_threads():
         ("bki,bkj->ij", [(9, 8, 3), (9, 8, 4)]),
         ("bki,kj->bij", [(2, 70, 3), (70, 4)]),
         ("k,k->", [(70,), (70,)]),
+        ("bki,bkj->bij", [(0, 70, 3), (0, 70, 4)]),
+        ("ki,kj->ij", [(70, 3), (70, 0)]),
         ("ki,k->i", [(70, 3), (70,)]),
     ],
 )
@@ -102,3 +99,13 @@ def test_arranged_products_have_the_same_value_and_derivative(sums, shapes):
     np.testing.assert_allclose(
         right, np.einsum(f"{result},{first}->{second}", ones, a), rtol=1e-4, atol=1e-4
     )
+
+
+def test_a_program_of_any_length_can_be_exported():
+    devices.configure()
+    export = jax.export
+    rows = jax.ShapeDtypeStruct(export.symbolic_shape("n, 3"), jnp.float32)
+    gradient = jax.jit(jax.grad(lambda w, x: jnp.tanh(x @ w).sum()))
+    program = export.export(gradient)(jax.ShapeDtypeStruct((3, 2), jnp.float32), rows)
+    x, w = np.ones((70, 3), np.float32), np.ones((3, 2), np.float32)
+    np.testing.assert_allclose(program.call(w, x), gradient(w, x), rtol=1e-5)

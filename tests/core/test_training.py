@@ -13,7 +13,7 @@ from qfolio.agents.ppo import PPO
 from qfolio.agents.sac import SAC
 from qfolio.core import faults
 from qfolio.core.contract import learning_of
-from qfolio.core.devices import Members, configure
+from qfolio.core.devices import Members, configure, places
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, static
 from qfolio.core.mdp import Step
@@ -53,11 +53,12 @@ def test_a_seed_alone_equals_the_seed_among_others(task, agent):
     ids=["PPO", "SAC"],
 )  # fmt: skip
 def test_a_seed_alone_equals_the_seed_among_others_in_a_continuous_task(agent):
-    """Programs for one device and for several round this agent's losses differently."""
-    task = Pendulum()
-    together, _ = trained(task, agent, [4, 5], [256])
-    alone, _ = trained(task, agent, [5], [256])
-    assert_same(alone.fetch(), jax.tree.map(lambda x: x[1:], together.fetch()))
+    """A program for three members of a place is another one than that for two or one."""
+    task, seeds = Pendulum(), range(2 * len(places()) + 1)
+    together, _ = trained(task, agent, seeds, [256])
+    alone, _ = trained(task, agent, [1], [256])
+    assert alone._programs is not together._programs
+    assert_same(alone.fetch(), jax.tree.map(lambda x: x[1:2], together.fetch()))
 
 
 def test_members_of_another_number_share_programs(task, agent):

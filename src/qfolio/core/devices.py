@@ -12,24 +12,25 @@ another way.
 import datetime
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
-from functools import cache
+from concurrent.futures import Future
 from importlib.metadata import version
 from platform import python_version
-from threading import Lock
-from typing import Any
+from threading import Lock, Thread
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import SingleDeviceSharding
-from jax.stages import Compiled
+from jax.stages import Compiled, Lowered
 from jaxtyping import Array
 
+from qfolio.core import products
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import cache_directory, can_write
-from qfolio.core.products import register
+
+T = TypeVar("T")
 
 LOCKSTEP = {"gpu", "tpu"}
 """Platforms that step their members in lockstep."""
@@ -58,7 +59,7 @@ the compiler instead of a flag, because a version that does not know a flag ends
 
 
 def configure() -> None:
-    """Compiles for speed, multiplies precisely and alike on all cores, keeps programs on disk.
+    """Compiles for speed, multiplies precisely, and keeps programs on disk.
 
     Has an effect only before jax first computes; settings that the user has made are kept. Raises
     QfolioError if one of them is for double precision.
@@ -81,7 +82,7 @@ def configure() -> None:
     if not jax.config.jax_default_matmul_precision:  # type: ignore[attr-defined]
         # GPUs would round the factors to three digits. CPUs compute as before.
         jax.config.update("jax_default_matmul_precision", "highest")
-    register()
+    products.register()
     programs = cache_directory() / "programs"
     # Where nothing can be written, jax would warn in each run.
     if not jax.config.jax_compilation_cache_dir and can_write(programs):  # type: ignore[attr-defined]
@@ -167,14 +168,25 @@ def require_memory(tree: Any, count: int) -> None:
         )
 
 
+def compiled(lowered: Lowered, *, once: bool = False) -> Compiled:
+    """Compiles a program; once: whether it is to run only once."""
+    try:
+        return lowered.compile(compiler_options=PRODUCTS_ONLY | effort(once=once))
+    except jax.errors.JaxRuntimeError as error:
+        if "INVALID_ARGUMENT" not in str(error):
+            raise
+        return lowered.compile()  # this version of XLA has no such option
+
+
 class Program:
-    """A program compiled once for each device on which it runs; its results are those of a call."""
+    """A program that is compiled once for each device."""
 
     def __init__(self, compile: Callable[[jax.Device], Compiled], first: jax.Device) -> None:
         self._compile, self._lock = compile, Lock()
         self._on = {first: compile(first)}
 
     def on(self, device: jax.Device) -> Compiled:
+        """The program for a device."""
         with self._lock:
             if device not in self._on:
                 self._on[device] = self._compile(device)
@@ -262,14 +274,12 @@ class Members:
             there = jax.tree.map(lambda x: x.update(sharding=sharding), shapes)
             with TRACING:
                 lowered = program.lower(np.int32(0), *there)
-            try:
-                return lowered.compile(compiler_options=PRODUCTS_ONLY | effort(once=once))
-            except jax.errors.JaxRuntimeError as error:
-                if "INVALID_ARGUMENT" not in str(error):
-                    raise
-                return lowered.compile()  # this version of XLA has no such option
+            return compiled(lowered, once=once)
 
-        return Program(compile, self._places[0])
+        made = Program(compile, self._places[0])
+        for device in self._places:  # a further GPU takes the program from the cache on disk
+            made.on(device)
+        return made
 
     def run(self, program: Program, *args: list[Any]) -> list[Any]:
         """What the program computes at each place, from arguments that have a tree for each.
@@ -283,16 +293,41 @@ class Members:
             taken = np.int32(len(self._shares[place]))
             return jax.block_until_ready(start(taken, *(arg[place] for arg in args)))
 
-        if len(self._places) == 1:
-            return [call(0)]
-        under_way = [_threads().submit(call, place) for place in range(len(self._places))]
-        wait(under_way)  # all of them, even if one fails
-        return [each.result() for each in under_way]
+        return side_by_side(call, len(self._places))
 
 
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(len(places()), "place")
+def side_by_side(call: Callable[[int], T], count: int) -> list[T]:
+    """``call(0)``, ``call(1)``, …, each in a thread of its own.
+
+    All of them end first if one fails, or on Ctrl-C: at its exit, Python would wait for a thread
+    that is still inside jax, and a second Ctrl-C would then crash the process.
+    """
+    found: list[Future[T]] = [Future() for _ in range(count)]
+
+    def complete(i: int) -> None:
+        try:
+            found[i].set_result(call(i))
+        except BaseException as error:
+            found[i].set_exception(error)
+
+    # Not a pool of threads, which takes no more work once the main thread has ended.
+    others = [Thread(target=complete, args=(i,)) for i in range(1, count)]
+    for thread in others:
+        thread.start()
+    interrupt = None
+    try:
+        complete(0)
+    except KeyboardInterrupt as error:
+        interrupt = error
+    while any(thread.is_alive() for thread in others):
+        try:
+            for thread in others:
+                thread.join()
+        except KeyboardInterrupt as error:
+            interrupt = error
+    if interrupt is not None:
+        raise interrupt
+    return [each.result() for each in found]
 
 
 def unkeyed(leaf: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from qfolio.core.devices import effort, keyed, unkeyed
+from qfolio.core.devices import compiled, keyed, unkeyed
 from qfolio.core.errors import QfolioError, one_line
 from qfolio.core.evaluation import Greedy
 from qfolio.core.mdp import Agent, Task, Transition
@@ -400,7 +400,7 @@ class HostPopulation(Population):
         self, one: Callable[..., Any], *args: Any, donate: bool = False, once: bool = False
     ) -> Any:
         program = jax.jit(one, donate_argnums=0 if donate else ())
-        return program.lower(*args).compile(compiler_options=effort(once=once))
+        return compiled(program.lower(*args), once=once)
 
     def _call(self, program: Any, *args: Any) -> Any:
         return program(*args)

@@ -17,7 +17,8 @@ from jax.interpreters import mlir
 from jaxtyping import Array
 
 SHORT = 64
-"""Most terms of a sum that Eigen leaves whole. It is then faster than copying the factors."""
+"""Most terms of a sum that Eigen leaves whole. For such a product Eigen is faster than YNNPACK with
+copies of the factors."""
 
 PRODUCT, AS_IT_IS = lax.dot_general_p, Primitive("product_as_it_is")
 
@@ -32,7 +33,7 @@ def register() -> None:
     arranged = mlir.lower_fun(_arranged, multiple_results=False)
 
     def lower(context: Any, *factors: Any, **how: Any) -> Any:
-        rule = arranged if _is_long(context.avals_in[0], **how) else usual
+        rule = arranged if _is_long(*context.avals_in, **how) else usual
         return rule(context, *factors, **how)
 
     mlir.register_lowering(AS_IT_IS, usual, platform="cpu")
@@ -45,9 +46,12 @@ def _kind(*factors: Any, **how: Any) -> jax.core.ShapedArray:
     return jax.core.ShapedArray(found.shape, found.dtype)
 
 
-def _is_long(left: Any, *, dimension_numbers: Any, **_: Any) -> bool:
+def _is_long(*factors: Any, dimension_numbers: Any, **_: Any) -> bool:
     (summed, _), _ = dimension_numbers
-    return left.dtype == jnp.float32 and prod(left.shape[i] for i in summed) > SHORT
+    terms = prod(factors[0].shape[i] for i in summed)
+    known = all(isinstance(length, int) for x in factors for length in x.shape)  # not of an export
+    divided = any(axis is not None for x in factors for axis in x.sharding.spec)
+    return known and not divided and factors[0].dtype == jnp.float32 and terms > SHORT
 
 
 def _arranged(*factors: Array, dimension_numbers: Any, **how: Any) -> Array:
@@ -70,9 +74,11 @@ def _arranged(*factors: Array, dimension_numbers: Any, **how: Any) -> Array:
     rests, matrices = [], []
     for factor, order in zip(factors, orders, strict=True):
         factor = lax.transpose(factor, order)
-        ours, rest = factor.shape[:count], factor.shape[count : factor.ndim - len(summed[0])]
+        last = factor.ndim - len(summed[0])
+        ours, rest, terms = factor.shape[:count], factor.shape[count:last], factor.shape[last:]
         rests.append(rest)
-        matrices.append(lax.optimization_barrier(factor.reshape(*ours, prod(rest), -1)))
+        matrix = factor.reshape(*ours, prod(rest), prod(terms))
+        matrices.append(lax.optimization_barrier(matrix))
     numbers = (((count + 1,), (count + 1,)), (tuple(range(count)),) * 2)
     found = AS_IT_IS.bind(*matrices, dimension_numbers=numbers, **how)
     return found.reshape(*found.shape[:count], *rests[0], *rests[1])

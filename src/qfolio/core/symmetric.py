@@ -1,8 +1,8 @@
 """Eigenvectors of symmetric matrices, and their linear systems.
 
 On a CPU a batch is taken one matrix at a time, unless its systems are small. The library behind jax
-splits a batch over threads that all devices share, and one of them waits for the others, so that
-several devices at once can deadlock. One matrix at a time is no slower.
+splits a batch over threads that all programs share, and one of them waits for the others, so that
+several programs at once can deadlock. One matrix at a time is no slower.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 """Handling of Ctrl-C: the first stops a training after its current chunk, a second at once.
 
-jax computes in the main thread, sometimes for seconds, and Python cannot interrupt it there: an
+The main thread waits for jax, sometimes for seconds, and Python cannot interrupt jax: an
 exception would come too late, end inside one of jax's callbacks, or crash the process at its exit.
 The command line therefore listens in a separate thread (``exit_on_ctrl_c``). Files on disk are
 complete at any moment, because they are written under another name and renamed.

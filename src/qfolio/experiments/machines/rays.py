@@ -90,7 +90,7 @@ class _Actors:
         self._opened, self._placed = time.monotonic(), executor.waits
         # Ray gives an actor without a GPU no GPU, but does not hide those of its machine.
         hidden = {} if executor.lockstep else {"JAX_PLATFORMS": "cpu"}
-        self._environment = environment(executor.devices) | hidden
+        self._environment = environment(executor.cpus) | hidden
         self._actor = ray.remote(
             num_cpus=executor.cpus, num_gpus=int(executor.lockstep), max_restarts=0
         )(Actor)

@@ -33,7 +33,7 @@ def prepare(environment: Mapping[str, str]) -> Ready:
 
 
 def environment(cores: int) -> dict[str, str]:
-    """This process's settings of XLA, for a worker with ``cores`` cores."""
+    """This process's settings of XLA, for a worker that computes on ``cores`` cores."""
     return {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "NPROC": str(cores)}
 
 
