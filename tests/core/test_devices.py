@@ -56,10 +56,11 @@ def test_jax_is_set_up_before_the_first_array_of_a_task(first, tmp_path):
     """Whatever is made first, as jax takes no settings of devices after its first array."""
     code = (
         f"{first}\n"
-        "import jax\n"
+        "import jax; from qfolio.core import devices\n"
+        "assert len(devices.places()) == len(devices.cores())\n"
         "print(jax.config.jax_default_matmul_precision, jax.config.jax_compilation_cache_dir)\n"
     )
-    unset = {"XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR"}
+    unset = {"NPROC", "XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR"}
     plain = {key: value for key, value in os.environ.items() if key not in unset}
     done = subprocess.run(
         [sys.executable, "-c", code], env=plain | {"QFOLIO_CACHE": str(tmp_path)},
@@ -90,7 +91,7 @@ def test_memory_counts_every_slot(monkeypatch):
         devices.require_memory(state, members.slots)
 
 
-def test_gpus_divide_members_among_them(tmp_path):
+def test_gpus_divide_members_among_them():
     """Two devices of the CPU stand for two GPUs."""
     code = (
         "import jax; from qfolio.core import devices; devices.LOCKSTEP = {'cpu'}\n"

@@ -181,12 +181,12 @@ def compiled(lowered: Lowered, *, once: bool = False) -> Compiled:
 class Program:
     """A program that is compiled once for each device."""
 
-    def __init__(self, compile: Callable[[jax.Device], Compiled], first: jax.Device) -> None:
+    def __init__(self, compile: Callable[[jax.Device], Compiled]) -> None:
         self._compile, self._lock = compile, Lock()
-        self._on = {first: compile(first)}
+        self._on: dict[jax.Device, Compiled] = {}
 
     def on(self, device: jax.Device) -> Compiled:
-        """The program for a device."""
+        """The program for a device, which is compiled when it is first asked for."""
         with self._lock:
             if device not in self._on:
                 self._on[device] = self._compile(device)
@@ -276,7 +276,7 @@ class Members:
                 lowered = program.lower(np.int32(0), *there)
             return compiled(lowered, once=once)
 
-        made = Program(compile, self._places[0])
+        made = Program(compile)
         for device in self._places:  # a further GPU takes the program from the cache on disk
             made.on(device)
         return made
@@ -311,17 +311,13 @@ def side_by_side(call: Callable[[int], T], count: int) -> list[T]:
             found[i].set_exception(error)
 
     # Not a pool of threads, which takes no more work once the main thread has ended.
-    others = [Thread(target=complete, args=(i,)) for i in range(1, count)]
-    for thread in others:
+    threads = [Thread(target=complete, args=(i,)) for i in range(count)]
+    for thread in threads:
         thread.start()
     interrupt = None
-    try:
-        complete(0)
-    except KeyboardInterrupt as error:
-        interrupt = error
-    while any(thread.is_alive() for thread in others):
+    while any(thread.is_alive() for thread in threads):
         try:
-            for thread in others:
+            for thread in threads:
                 thread.join()
         except KeyboardInterrupt as error:
             interrupt = error

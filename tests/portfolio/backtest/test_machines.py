@@ -123,7 +123,7 @@ def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
     found: list[dict[str, bytes]] = []
     for executor in (Here(), Processes(1), Processes(2, cores=1)):
         backtest = Backtest.create(
-            prices, agents | {"dqn": DQN}, train="500d", test="100d", seeds=2,
+            prices, AGENTS | agents | {"dqn": DQN}, train="500d", test="100d", seeds=2,
             out=tmp_path / f"{len(found)}",
         )  # fmt: skip
         backtest.run(executor=executor)
