@@ -12,8 +12,11 @@ from qfolio.core.files import read_json, write_json
 from qfolio.core.text import quote
 from qfolio.core.version import __version__
 
-AGENT_NAME = r"^[\w-]+(:[\w-]+)?$"
-"""Pattern of the names that agents have in a comparison or a backtest, such as dqn or dqn:fast."""
+AGENT_NAME = r"^\w[\w-]*(:[\w-]+)?$"
+"""Pattern of the names that agents have in a comparison or a backtest, such as dqn or dqn:fast.
+
+A spreadsheet would take a name that starts with - for a formula.
+"""
 
 AgentName = Annotated[str, msgspec.Meta(pattern=AGENT_NAME)]
 
@@ -28,8 +31,8 @@ def require_agent_names(names: Collection[str]) -> None:
     for name in names:
         if not (isinstance(name, str) and re.fullmatch(AGENT_NAME, name)):
             raise QfolioError(
-                f"An agent is called {quote(name)}; use letters, digits, - and _, and at most one "
-                "colon within, as in tilts:low-risk."
+                f"An agent is called {quote(name)}; use letters, digits, - and _, with no - at "
+                "the start and at most one colon within, as in tilts:low-risk."
             )
         folder = agent_folder(name).casefold()  # some systems do not tell a from A
         other = next((n for n in names if n != name and agent_folder(n).casefold() == folder), None)

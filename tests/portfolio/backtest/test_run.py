@@ -522,6 +522,7 @@ def test_a_wrong_baseline_of_ones_own_is_found_before_the_training(tmp_path, mon
         ({"agents": changed("pathwise", horizon=13)}, "^pathwise: rollout_length .* divide the 13"),
         ({"episodes": 3}, "are for agents without a preset; change those of a preset with"),
         ({"agents": {"../dqn": AGENTS["dqn"]}}, "called '../dqn'; use letters, digits, - and _"),
+        ({"agents": {"-dqn": AGENTS["dqn"]}}, "called '-dqn'; .* no - at the start"),
         ({"agents": {"dqn:a": AGENTS["dqn"], "dqn-a": AGENTS["dqn"]}}, "would share a folder"),
         ({"agents": {"x": AGENTS["dqn"], "x-together": AGENTS["dqn"]}}, "all seeds of x hold tog"),
     ],

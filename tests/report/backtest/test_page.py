@@ -14,6 +14,7 @@ from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.statistics.differences import Contrast
 from qfolio.portfolio.backtest.statistics.verdict import verdicts
 from qfolio.report.backtest.data import BacktestData, StrategySeries, shown_order
+from qfolio.report.backtest.facts import key_facts
 from qfolio.report.backtest.page import render_backtest
 from qfolio.report.rendering import number, percent
 
@@ -237,6 +238,20 @@ def test_costs_by_kind_have_a_table() -> None:
     text = Page(page).text
     assert "that the cost model itemized(impact=1) leaves out" in text
     assert "cash earns nothing" not in text
+
+
+@pytest.mark.parametrize(
+    ("cost_model", "words"),
+    [
+        ("proportional", "of the value traded"),
+        ("itemized(impact=1)", "of commission, itemized costs"),
+        ("mine:Costs(fee=2)", "of commission, costs of mine:Costs"),
+    ],
+)
+def test_key_facts_name_the_cost_model(cost_model: str, words: str) -> None:
+    data = usual(60)
+    facts = key_facts(replace(data, config={**data.config, "cost_model": cost_model}))
+    assert f"25\N{NARROW NO-BREAK SPACE}bp {words}" in facts
 
 
 def test_growth_by_cost_has_a_table() -> None:

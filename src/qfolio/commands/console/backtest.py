@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 def describe_backtest(backtest: "Backtest") -> str:
     """What a backtest trains and tests, in a line; its memory, if that is large."""
+    from qfolio.core.settings import called
     from qfolio.portfolio.backtest import memory
     from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL
     from qfolio.portfolio.prices.findings import day
@@ -22,11 +23,12 @@ def describe_backtest(backtest: "Backtest") -> str:
     large = f" It needs about {size / 2**30:.1f} GiB of memory, beside what training takes."
     folds, seeds = amount(len(backtest.folds), "fold"), amount(config.seeds, "seed")
     first, last = backtest.dates[[0, -1]]
-    items = "" if config.cost_model == PROPORTIONAL else " (itemized)"
+    kind = called(config.cost_model)[0]
+    model = "" if kind == PROPORTIONAL else f" ({kind})"
     return (
         f"{folds} ({day(first)} to {day(last)}) · "
         f"{amount(len(backtest.prices.assets), 'asset')} · {' and '.join(backtest.agents)} · "
-        f"{seeds} · {config.cost * 1e4:g} bp{items} · lag {config.lag} · {config.device}"
+        f"{seeds} · {config.cost * 1e4:g} bp{model} · lag {config.lag} · {config.device}"
         + (f".{large}" if size > memory.MENTIONED else "")
     )
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from qfolio.core.settings import called
 from qfolio.core.statistics import FEWEST_SEEDS
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
@@ -34,11 +35,12 @@ def key_facts(data: BacktestData) -> list[str]:
 
 
 def _cost(settings: dict[str, Any]) -> str:
-    """What a trade costs, in a few words; itemized costs have parts that no rate sums up."""
-    rate = basis_points(settings["cost"])
-    if settings["cost_model"] == PROPORTIONAL:
+    """What a trade costs, in a few words; other cost models have parts that no rate sums up."""
+    rate, (kind, _) = basis_points(settings["cost"]), called(settings["cost_model"])
+    if kind == PROPORTIONAL:
         return f"{rate} of the value traded"
-    return f"{rate} of commission, itemized costs" if settings["cost"] else "itemized costs"
+    costs = "itemized costs" if kind == "itemized" else f"costs of {kind}"
+    return f"{rate} of commission, {costs}" if settings["cost"] else costs
 
 
 def _universe(prices: dict[str, Any]) -> list[str]:
