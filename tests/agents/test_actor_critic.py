@@ -579,6 +579,20 @@ def test_an_actor_explores_by_noise_that_lasts():
     assert DDPG(hidden=(8,)).init(Aim(), jax.random.key(0)).noise is None
 
 
+def test_noise_starts_anew_where_an_episode_ends_or_is_cut():
+    agent = DDPG(hidden=(8,), num_envs=3, noise_theta=0.25)
+    state = agent.init(Aim(), jax.random.key(0))
+    assert state.noise is not None
+    step = rollout_of(jnp.zeros((1, 3)))._replace(
+        terminated=jnp.array([[False, True, False]]), truncated=jnp.array([[False, False, True]])
+    )
+    after = agent.observe(state, step).noise
+    drawn = state.noise.step(1.0, jnp.ones(3, bool))
+    assert after is not None
+    kept = 0.75 * state.noise.value * jnp.array([[1], [0], [0]])
+    np.testing.assert_allclose(after.value, kept + drawn.value, rtol=1e-5, atol=1e-6)
+
+
 def test_soft_actor_critic_explores_by_noise_that_lasts():
     """Each draw alone is the policy's; 1 − θ = 0.6 of the last step's noise stays."""
     task, n = Aim(), 20_000

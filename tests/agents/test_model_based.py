@@ -20,7 +20,7 @@ from qfolio.learning.targets import unsquash
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
-from populations import first_member, train_to
+from populations import assert_same, first_member, train_to
 from probes import Aim
 
 SMALL: dict[str, Any] = {
@@ -172,6 +172,57 @@ def test_the_models_gradient_against_differences():
         slope = (loss(1e-6) - loss(-1e-6)) / 2e-6
         assert abs(slope) > 1e-3
         np.testing.assert_allclose(jax.jit(jax.grad(loss))(0.0), slope, rtol=1e-6)
+
+
+def observed(agent, seed=0):
+    """An agent that has seen a step of Aim in each environment, from 0.5."""
+    state = jit(lambda: agent.init(Aim(), jax.random.key(seed)))()
+    half, one = jnp.full((1, 4, 1), 0.5), jnp.ones((1, 4))
+    never = jnp.zeros((1, 4), bool)
+    return jit(agent.observe)(
+        state, Transition(half[..., 0], half, half, one, half[..., 0], half, never, never)
+    )
+
+
+def test_the_models_rate_is_a_multiple_of_the_critics():
+    """Adam's first step is in proportion to it."""
+
+    def moved(ratio):
+        agent = MBPO(**{**SMALL, "model_updates": 1}, model_learning_rate_ratio=ratio)
+        state = observed(agent)
+        model = jit(lambda: agent._study(state, jax.random.key(1))[0])()
+        members = jax.tree.leaves(model.members), jax.tree.leaves(state.model.members)
+        return np.concatenate([np.ravel(a - b) for a, b in zip(*members, strict=True)])
+
+    once = moved(1.0)
+    assert abs(once).max() == pytest.approx(SMALL["learning_rate"], rel=0.01)
+    np.testing.assert_allclose(moved(0.25), once / 4, atol=1e-6)
+    np.testing.assert_array_equal(moved(0.0), 0 * once)
+
+
+def test_what_is_imagined_begins_again_where_an_episode_ends():
+    agent, rows = MBPO(**{**SMALL, "model_rollout_length": 3}), jnp.ones((3, 1))
+
+    def seen(terminal):
+        """Imagined observations by time, if each step adds 1."""
+        outputs = jnp.concatenate([rows, 0 * rows, terminal * rows], 1)
+        model = Model(Constant(outputs), jnp.ones(1), Box(1, 2.0))
+        state = observed(agent)
+        imagined = jit(lambda: agent._imagine(model, state, jax.random.key(1)))()
+        steps = imagined.unpack(imagined.rows[: 3 * SMALL["model_rollout_batch"]])
+        return steps.observation.reshape(3, -1)
+
+    np.testing.assert_allclose(seen(0.0), np.array([[0.5], [1.5], [2.5]]) * np.ones(32))
+    np.testing.assert_allclose(seen(1.0), np.full((3, 32), 0.5))
+
+
+def test_steps_imagined_from_other_data_are_forgotten():
+    agent = MBPO(**SMALL)
+    old, fresh = observed(agent, 0), jit(lambda: agent.init(Aim(), jax.random.key(1)))()
+    old = eqx.tree_at(lambda s: s.imagined.size, old, old.imagined.size + 64)
+    new = agent.carry_over(old, fresh)
+    assert (int(new.replay.size), int(new.imagined.size)) == (0, 0)
+    assert_same((new.learned, new.model), (old.learned, old.model))
 
 
 def test_each_member_counts_real_steps_as_often_as_chance_says():

@@ -541,6 +541,28 @@ def test_reinforce_learns_from_whole_episodes_alone(time_limit_terminal):
     )
 
 
+def test_the_last_gradient_step_has_the_share_of_the_rate_that_remains():
+    batch = Batch(
+        observation=jnp.ones((3, 1)), action=jnp.array([0, 1, 1]), log_prob=jnp.zeros(3),
+        advantage=jnp.array([1.0, 2, 3]), target=jnp.array([1.0, 2, 3]),
+    )  # fmt: skip
+
+    def moved(final):
+        agent = A2C(
+            hidden=(4,), optimizer="sgd", learning_rate=0.1, learning_rate_steps=4.0,
+            learning_rate_final=final,
+        )  # fmt: skip
+        start = agent.init(OneState(), jax.random.key(0))
+        start = eqx.tree_at(lambda s: s.optimizer.count, start, jnp.array(3, jnp.int32))
+        after = jit(lambda: agent.descend(OneState(), start, batch)[0])()
+        weights = jax.tree.leaves(after.weights), jax.tree.leaves(start.weights)
+        return np.concatenate([np.ravel(a - b) for a, b in zip(*weights, strict=True)])
+
+    whole = moved(1.0)
+    assert abs(whole).max() > 1e-3
+    np.testing.assert_allclose(moved(0.25), whole / 4, atol=1e-6)
+
+
 def test_sums_of_rewards_do_not_go_on_with_other_data():
     agent = A2C(hidden=(4,), normalize_rewards=True)
     fresh = agent.init(Pendulum(), jax.random.key(0))

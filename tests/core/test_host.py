@@ -322,6 +322,14 @@ def test_every_graded_episode_is_that_of_its_seed():
         assert_same(population.evaluate(start_keys(few)).returns, many[:, :few])
 
 
+def test_short_episodes_of_training_leave_grades_alone():
+    """An episode pays 1 at each of its four steps, of which training takes two."""
+    agent = dataclasses.replace(SMALL, episode_steps=2)
+    population = trained(task(Endless), agent, [0], 8)
+    assert population.episodes == 8
+    np.testing.assert_array_equal(population.evaluate(start_keys(3)).returns, np.full((1, 3), 4))
+
+
 @pytest.mark.parametrize("kind", [Numbered, Aim, Shares])
 def test_a_policy_acts_in_the_environment_as_it_is_graded(kind):
     """With states and actions that do not begin at 0, with bounds, and with whole numbers."""
@@ -391,6 +399,15 @@ def test_returns_do_not_reach_from_a_cut_episode_into_a_new_one():
     assert ends(population)[5] == False  # noqa: E712 (only if training goes on)
     population.advance(2)
     assert ends(population) == [False, False, False, True, False, True, False, False]
+
+
+def test_environments_that_begin_again_do_not_repeat_themselves():
+    """Each of these episodes is a step in a state that is drawn at its start."""
+    population = trained(task(Numbered), SMALL, [0], 16)
+    population.restore(population.fetch())
+    states = stored(train_to(population, 32)).observation
+    assert set(states.tolist()) == {0, 1}
+    assert not np.array_equal(states[:32], states[32:])
 
 
 def test_what_was_learned_outlives_an_exception_of_an_environment(monkeypatch):

@@ -16,7 +16,7 @@ from qfolio.core.contract import learning_of
 from qfolio.core.devices import Members, configure, places
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, static
-from qfolio.core.mdp import Step
+from qfolio.core.mdp import Agent, Discrete, Step
 from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin, chunk_steps
 from qfolio.tasks.pendulum import Pendulum
@@ -228,6 +228,56 @@ def test_the_return_of_a_record_is_the_sum_of_rewards(task, agent):
     rewards = stored(population).reward[:50].reshape(25, 2)
     last = records[-1]
     np.testing.assert_allclose(last.returns[0][last.finished[0]], rewards.sum(0), rtol=1e-5)
+
+
+class Many(Endless):
+    """Four steps, with so many actions that two keys hardly choose the same."""
+
+    horizon: int = static(4)
+
+    @property
+    def actions(self):
+        return Discrete(2**20)
+
+
+class Keyed(Agent):
+    """Acts by its key alone, and reports whether it learns with the same one."""
+
+    num_envs: int = static(1)
+    episode_steps: int = static(0)
+
+    discount = None
+
+    def warm_up(self):
+        return 2
+
+    def init(self, task, key):
+        return jnp.array(0.0)
+
+    def act(self, state, observation, key):
+        return jax.random.randint(key, (1,), 0, 2**20)
+
+    def observe(self, state, rollout):
+        return state
+
+    def learn(self, task, state, rollout, key):
+        same = (self.act(state, None, key) == rollout.action[-1]).mean()
+        return state, {"same": same, "learned": jnp.array(1.0)}
+
+    def weights(self, state):
+        return state
+
+    def policy(self, weights, observation):
+        return jnp.zeros(len(observation), jnp.int32)
+
+
+def test_learning_has_a_key_of_its_own_and_metrics_are_means_over_its_steps():
+    """The first two of the first episode's four steps are only observed."""
+    _, records = trained(Many(), Keyed(), [0], [8])
+    found = records[-1]
+    assert found.finished.sum() == 2
+    for name, mean in {"same": 0.0, "learned": 1.0}.items():
+        np.testing.assert_array_equal(found.metrics[name][found.finished], [mean, mean])
 
 
 def test_training_episodes_can_be_cut_shorter(task):

@@ -588,6 +588,14 @@ def test_an_optimum_of_ones_own_is_that_of_the_grade():
     assert grade["optimum"] == 0.5
 
 
+def test_the_optimum_of_a_curve_is_that_of_its_starts():
+    """The first 64 of 1,024, which earn 0, 1, 2, …"""
+    task = Solved(solution=Returns(lambda keys: np.arange(len(keys))))
+    run = Run.create(task, DQN(hidden=(4,)), episodes=1)
+    assert curve_optimum(run.population) == 31.5
+    assert run.grade()["optimum"] == 511.5
+
+
 def spoil_checkpoint(folder, how):
     path = folder / "checkpoint.safetensors"
     if how == "missing":

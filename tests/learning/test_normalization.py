@@ -13,6 +13,7 @@ from qfolio.agents.ppo import PPO
 from qfolio.agents.sac import SAC
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
+from qfolio.core.mdp import Transition
 from qfolio.core.population import Population
 from qfolio.experiments.run import Run
 from qfolio.learning.normalization import Moments, NormalizationConfig, Normalizer, RewardScale
@@ -91,6 +92,22 @@ def test_observations_are_standardised_and_clipped():
     np.testing.assert_allclose(given, [[2, 0], [-10, 10]], rtol=1e-6)
     assert normalizer.unit == 1.0
     np.testing.assert_array_equal(normalizer.reward(jnp.array([123.0])), [123])
+
+
+def test_the_range_of_rewards_is_normalized_as_rewards_are():
+    """The returns 4 and −2 have a standard deviation of 3; the metric is in the task's units."""
+
+    class Ranged(SAC):
+        def practise(self, learned, draw, rewards, key):
+            np.testing.assert_allclose(rewards, [-2 / 3, 4 / 3], rtol=1e-6)
+            return learned, {"q": rewards[1]}
+
+    agent = Ranged(hidden=(4,), num_envs=2, normalize_rewards=True)
+    state, zeros = agent.init(Aim(), jax.random.key(0)), jnp.zeros((1, 2))
+    view, never = zeros[..., None], jnp.zeros((1, 2), bool)
+    step = Transition(zeros, view, view, jnp.array([[4.0, -2.0]]), zeros, view, never, never)
+    _, metrics = agent.learn(Aim(), state, step, jax.random.key(1))
+    np.testing.assert_allclose(metrics["q"], 4, rtol=1e-6)
 
 
 def test_nothing_is_kept_or_changed_without_the_settings():

@@ -2,14 +2,18 @@
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qfolio.agents.a2c import A2C
 from qfolio.agents.dqn import DQN
+from qfolio.agents.ppo import PPO
 from qfolio.core.errors import QfolioError
 from qfolio.learning import optimizer
 from qfolio.learning.optimizer import KINDS, OptimizerConfig
+from qfolio.tasks.pendulum import Pendulum
 
 
 def stepped(*gradients, **settings):
@@ -65,6 +69,13 @@ def test_every_optimizer_remembers_the_same_arrays(kind):
     """So that checkpoints of all kinds have one form."""
     state = optimizer.begin(jnp.zeros(3), DQN(optimizer=kind)._optimizer)
     assert (state.count.shape, state.mu.shape, state.nu.shape) == ((), (3,), (3,))
+
+
+@pytest.mark.parametrize("kind", [A2C, DQN, PPO])
+def test_agents_descend_by_the_optimizer_that_is_set(kind):
+    agent = kind(hidden=(4,), optimizer="rmsprop", rmsprop_decay=0.5, optimizer_epsilon=0.25)
+    state = agent.init(Pendulum(torques=3), jax.random.key(0))
+    assert state.optimizer.config == OptimizerConfig("rmsprop", 0.5, 0.25)
 
 
 @pytest.mark.parametrize(

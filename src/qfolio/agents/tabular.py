@@ -28,9 +28,6 @@ from qfolio.core.mdp import Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning.exploration import EpsilonSchedule, epsilon_greedy
 from qfolio.learning.targets import bootstrap, td_target
 
-Values = Float[Array, "state action"]
-
-
 Tables = Float[Array | np.ndarray, "*member table state action"]
 """One table, or two for double Q-learning, which acts on their mean."""
 

@@ -163,6 +163,7 @@ def _new(
     out: Path | None,
 ) -> "Tuning":
     from qfolio.experiments import presets
+    from qfolio.experiments.budget import SCHEDULES
     from qfolio.experiments.tuning import search
     from qfolio.experiments.tuning.run import Tuning
 
@@ -177,8 +178,8 @@ def _new(
     task = settings.build(task_class, {**preset.task, **task_settings})
     usual = preset.build(**chosen)
     share = budget.env_steps(task, usual) / preset.budget.env_steps(task, usual)
-    schedules = {"learning_rate_steps", "importance_steps"} & preset.settings.keys()
-    scheduled = {name: round(preset.settings[name] * share, 1) for name in schedules}
+    lengths = {k: v * share for k, v in preset.settings.items() if k in SCHEDULES}
+    scheduled = {k: round(v, 1) or v for k, v in lengths.items()}  # a length of 0 is refused
     agent = preset.build(**{**scheduled, **chosen})
     space = space or [dim for dim in search.usual(agent) if dim.name not in chosen]
     if both := [dim.name for dim in space if dim.name in settings.names(task_class)]:

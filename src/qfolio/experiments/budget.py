@@ -10,6 +10,9 @@ if TYPE_CHECKING:
     from qfolio.core.population import Population
 
 
+SCHEDULES = ("learning_rate_steps", "epsilon_steps", "importance_steps")
+"""Settings of agents in which the length of training counts."""
+
 MOST_STARTS = 2**20
 """Largest number of start states of a grade, which are played side by side."""
 
@@ -55,10 +58,6 @@ class Budget:
         from qfolio.core.training import episode_steps
 
         return episode_steps(task, agent) if self.steps is None else 1
-
-    def to_json(self) -> dict[str, int]:
-        """``{"episodes": n}`` or ``{"steps": n}``."""
-        return {self.unit: self.amount}
 
     def planned(self, population: "Population") -> int:
         """Total steps of all environments of a member, rounded up to whole rollouts."""

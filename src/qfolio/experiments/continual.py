@@ -31,7 +31,7 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.population import Population
 from qfolio.core.statistics import regret
 from qfolio.core.training import TrainingState
-from qfolio.experiments.budget import Budget, seed_range, unlearned
+from qfolio.experiments.budget import SCHEDULES, Budget, seed_range, unlearned
 from qfolio.experiments.comparison.ranking import middle_steps, steps_within
 from qfolio.experiments.described import agent_of, describe, plain, require_described, task_of
 from qfolio.experiments.fit import Listener, Training, fit
@@ -105,8 +105,7 @@ class Plan:
     @property
     def renewed(self) -> Agent:
         """The agent, with shorter schedules and less exploration."""
-        schedules = ("learning_rate_steps", "epsilon_steps", "importance_steps")
-        own = [name for name in schedules if hasattr(self.agent, name)]
+        own = [name for name in SCHEDULES if hasattr(self.agent, name)]
         agent = self._set(**{name: self.renewal * getattr(self.agent, name) for name in own})
         if isinstance(epsilon := getattr(agent, "epsilon_start", None), float):
             agent = dataclasses.replace(agent, epsilon_start=min(epsilon, self.epsilon))

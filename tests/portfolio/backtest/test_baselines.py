@@ -104,6 +104,8 @@ def test_months_count_from_the_first_decision_of_the_test() -> None:
     rows = decisions("equal-weight-monthly", FOLDS, prices(), month=40)  # longer than a fold
     np.testing.assert_array_equal(np.flatnonzero(~np.isnan(rows[:, 0])), [0, 40])
     assert not np.isnan(decisions("equal-weight-monthly", FOLDS, prices(), month=1)).any()
+    rows = decisions("equal-weight-monthly", FOLDS, prices(), month=7)  # not from row 0, either
+    np.testing.assert_array_equal(~np.isnan(rows[:, 0]), np.arange(45) % 7 == 0)
 
 
 def test_windows_end_with_the_decision() -> None:

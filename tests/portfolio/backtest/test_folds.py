@@ -46,6 +46,7 @@ def test_calendar_lengths():
     folds = walk_forward(leap, "1y", "1y", 0)
     assert folds[0].name == "2001-02-28"
     assert latest("x", DAYS, "1m").train == slice(len(DAYS) - 32, len(DAYS))
+    assert latest("x", DAYS, "10d").train == slice(len(DAYS) - 11, len(DAYS))
     assert latest("x", DAYS, "1m", expanding=True).train == slice(0, len(DAYS))
 
 

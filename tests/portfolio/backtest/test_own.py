@@ -180,6 +180,16 @@ def test_a_holding_from_before_the_test_has_earned_interest():
     assert np.isnan(found[1:]).all()
 
 
+def test_the_latest_order_from_before_the_test_is_held():
+    prices = table()
+    task = Portfolio.of(prices, window=5, horizon=20)
+    given = np.array([[0.5, 0.5, 0.0, 0.0], [0.4, 0.0, 0.6, 0.0]])
+    own = Own("weights", prices.dates[[10, 50]], given)
+    found = place("mine", own, prices, slice(100, 150), task, 1.0).decisions
+    worth = np.array([0.4, 0, 0.6 * prices.values[100, 1] / prices.values[50, 1], 0])
+    np.testing.assert_allclose(found[0], worth / worth.sum(), rtol=1e-12)
+
+
 def test_cash_until_the_first_order_and_dates_between_rows():
     prices = table(every=7)  # Wednesdays
     source = pd.DataFrame({"date": ["2021-12-31", "2022-03-31"], "A": [1.0, 0.5], "B": [0, 0.5]})
@@ -393,6 +403,16 @@ def test_the_report_says_where_a_strategy_breaks_the_mandate():
     backtest = create(mandate=mandate, strategies={"calm": calm})
     notes = backtest.replay.others({}, backtest._own, "equal-weight")[1]
     assert any(note.startswith("calm keeps the mandate in all of its 60 orders") for note in notes)
+
+
+def test_the_turnover_of_a_year_counts_anew_in_the_next():
+    """Rows are three days apart, so that row 122 is the first of 2021; 0.9 is bought and sold."""
+    mine = np.full((ROWS, 3), np.nan)
+    mine[[100, 140]] = [[0.3, 0.3, 0.3], [0.0, 0.0, 0.0]]
+    mandate = {"trading": {"turnover_a_year": 1.2}}
+    backtest = create(table(every=3), mandate=mandate, strategies={"mine": mine})
+    (said,) = backtest.replay.others({}, backtest._own, "equal-weight")[1][-1:]
+    assert said == "mine keeps the mandate in all of its 2 orders."
 
 
 def test_a_strategy_breaks_limits_that_depend_on_what_it_held_and_traded_before():

@@ -131,9 +131,9 @@ def test_orders_through_zero_are_two_where_brokers_tell_short_sales():
     whole = plan([0.9, -0.2, 0.3], [5, -1], 1000, cost=0.0, whole_shares=True)
     rows = order_rows(whole, "alpaca", "USD")[1]
     assert [row[:3] for row in rows] == [
-        ["A", 5, "sell"], ["A", 10, "sell"], ["B", 1, "buy"], ["B", 8, "buy"],
+        ["A", 5, "sell"], ["A", 11, "sell"], ["B", 1, "buy"], ["B", 8, "buy"],
     ]  # fmt: skip
-    assert [str(row[1]) for row in rows] == ["5", "10", "1", "8"]
+    assert [str(row[1]) for row in rows] == ["5", "11", "1", "8"]
     long = plan([0.5, 0.3, 0.2], [20, 10], 0, cost=0.0)  # fractions of what is owned may be sold
     assert [row[:3] for row in order_rows(long, "alpaca", "USD")[1]] == [
         ["A", 8, "sell"], ["B", 6, "sell"],
@@ -141,7 +141,7 @@ def test_orders_through_zero_are_two_where_brokers_tell_short_sales():
     header, rows = order_rows(whole, "schwab", "USD")
     assert header[2:4] == ["instruction", "quantity"]
     assert [row[:4] for row in rows] == [
-        ["A", "EQUITY", "SELL", 5], ["A", "EQUITY", "SELL_SHORT", 10],
+        ["A", "EQUITY", "SELL", 5], ["A", "EQUITY", "SELL_SHORT", 11],
         ["B", "EQUITY", "BUY_TO_COVER", 1], ["B", "EQUITY", "BUY", 8],
     ]  # fmt: skip
 

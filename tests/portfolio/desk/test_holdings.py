@@ -83,6 +83,16 @@ def test_all_digits_of_shares_that_are_cashed_out_are_shown():
     assert said == ["B is delisted; 1,234,567.5 shares count as 1,234,567.50 in cash."]
 
 
+def test_an_asset_without_any_price_yet_is_not_cashed_out():
+    listed, values = np.array([[True, False, False], [False, True, False]]), np.ones((2, 3))
+    values[0, 1], values[:, 2] = np.nan, np.nan
+    prices = price_table(values, listed=listed)
+    shares, cash, said = cashed_out(np.array([2.0, 3.0, 4.0]), 5.0, prices)
+    assert shares.tolist() == [0, 3, 4]
+    assert cash == 5 + 2
+    assert len(said) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

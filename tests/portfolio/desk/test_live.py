@@ -1,5 +1,7 @@
 """The ledger marked to market, against replays and by hand."""
 
+import dataclasses
+
 import msgspec
 import numpy as np
 import pytest
@@ -367,6 +369,23 @@ def test_a_split_and_a_deposit_earn_nothing():
     np.testing.assert_allclose(found.wealth, [1000, 1200, 1700])
     np.testing.assert_allclose(found.returns, [0, 0.2, 0])
     np.testing.assert_allclose(found.flows, [0, 0, 500])
+
+
+def test_an_order_of_before_a_split_buys_as_much_after_it():
+    """50 shares at 10 are 100 units of a table that is adjusted for a later split of 2."""
+    prices, one = by_hand([[5.0], [5.0], [6.0]], 0.0, 1000.0, 50.0)
+    one = msgspec.structs.replace(one, prices=[10.0])
+    found = mark([one], prices, Proportional(0.0), lag=1)
+    np.testing.assert_allclose(found.wealth, [100 * 6 + 500])
+    np.testing.assert_allclose(found.returns, [0.1])
+
+
+def test_an_order_is_void_once_its_asset_is_delisted():
+    prices, one = by_hand([[10.0], [10.0], [10.0]], 0.0, 1000.0, 50.0)
+    ended = dataclasses.replace(prices, listed=np.array([[True], [False], [False]]))
+    found = mark([one], ended, Proportional(0.01), lag=1)
+    np.testing.assert_array_equal(found.costs, [0])
+    np.testing.assert_array_equal(found.wealth, [1000])
 
 
 def test_a_ledger_that_does_not_fit_is_refused():

@@ -5,9 +5,10 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.baselines.equal_weight import BuyAndHold
+from qfolio.portfolio.backtest.baselines.equal_weight import BuyAndHold, EqualWeight
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.folds import spell_all
+from qfolio.portfolio.backtest.own import Own
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.desk import Desk
@@ -210,6 +211,50 @@ def test_a_margin_call_reduces_what_a_baseline_would_keep():
     for each, gross in ((0.6, 1.7), (0.55, 1.65)):
         held = {"cash": 1 - 3 * each, "A": each, "B": each, "C": each}
         assert 1 - rule.weights(prices, held)["cash"] == pytest.approx(gross)
+
+
+def test_what_a_baseline_keeps_of_a_delisted_asset_is_cash():
+    listed = np.ones((160, 3), bool)
+    listed[150:, 2] = False
+    prices = price_table(table().values, listed=listed)
+    task = Portfolio.of(prices, window=10)
+    rule = Rule(
+        "buy-and-hold", BuyAndHold(), prices.assets, task, train="100d", expanding=True, cap=1.0
+    )
+    found = rule.weights(prices, {"cash": 0.1, "A": 0.5, "C": 0.4})
+    assert found == pytest.approx({"cash": 0.5, "A": 0.5, "B": 0, "C": 0})
+
+
+def test_what_an_order_holds_of_a_delisted_asset_is_cash():
+    listed = np.ones((160, 3), bool)
+    listed[150:, 2] = False
+    prices = price_table(table().values, listed=listed)
+    own = Own("weights", prices.dates[[140]], np.array([[0.1, 0.5, 0.0, 0.4]]))
+    strategy = Ordered("mine", own, prices.assets, Portfolio.of(prices, window=10), 1.0)
+    assert strategy.weights(prices) == pytest.approx({"cash": 0.5, "A": 0.5, "B": 0, "C": 0})
+
+
+def test_a_baseline_keeps_what_is_within_the_band_of_the_calendar():
+    prices = table()
+    task = Portfolio.of(prices, calendar="drift:0.05", window=10)
+    rule = Rule(
+        "equal-weight", EqualWeight(), prices.assets, task, train="100d", expanding=True, cap=1.0
+    )
+    near = {"cash": 0.0, "A": 0.38, "B": 0.32, "C": 0.3}
+    assert rule.weights(prices, near) == near
+    far = {"cash": 0.0, "A": 0.4, "B": 0.3, "C": 0.3}
+    assert rule.weights(prices, far)["A"] == pytest.approx(1 / 3)
+
+
+def test_a_baseline_trades_what_is_left_of_the_turnover_of_the_year():
+    prices = table()
+    mandate = {"trading": {"turnover_a_year": 0.5}}
+    task = Portfolio.of(prices, mandate=mandate, window=10)
+    rule = Rule(
+        "equal-weight", EqualWeight(), prices.assets, task, train="100d", expanding=True, cap=1.0
+    )
+    for spent, bought in ((0.0, 0.5), (0.2, 0.3), (0.7, 0.0)):
+        assert 1 - rule.weights(prices, spent=spent)["cash"] == pytest.approx(bought, abs=1e-6)
 
 
 def test_prices_that_begin_later_than_a_baseline_looks_back_are_named(desk):

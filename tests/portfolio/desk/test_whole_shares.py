@@ -102,6 +102,19 @@ def test_a_short_position_is_not_bought_long_by_rounding(held, lot, bought):
     assert Allocation.of(policy, table, np.array([held]), 1e4).trades.tolist() == [bought]
 
 
+def test_short_positions_are_rounded_to_the_nearest_lot():
+    """Of 26 that should be 9 shares short each, lots of 10 sold where none left 5 lots too much."""
+    names = tuple(f"S{i}" for i in range(26))
+    mandate = mandate_text(
+        {"assets": {"floor": -0.06}, "cash": {"min": 0.7}, "trading": {"lot": 10}}, names
+    )
+    table = Prices(np.arange(2).astype("datetime64[D]"), names, np.full((2, 26), 10.0))
+    policy = Fixed(np.append(1.234, np.full(26, -0.009)), Proportional(0.0), mandate)
+    trades = Allocation.of(policy, table, np.zeros(26), 1e4).trades
+    assert trades.tolist().count(-10) in (23, 24)  # of 23.4 lots
+    assert trades.tolist().count(0) == 26 - trades.tolist().count(-10)
+
+
 def test_whole_shares_of_lots_that_are_not_whole():
     mandate = mandate_text({"trading": {"lot": {"A": 0.5, "B": 1.5}}}, ("A", "B"))
     policy = Fixed([0.01, 0.49, 0.5], Proportional(0.001), mandate)

@@ -111,8 +111,12 @@ def test_sharpe_ratios_are_in_excess_of_cash():
     without, with_rates = evidence(risky(), "a"), evidence(risky(free=0.0002), "a")
     assert without.baseline == "calm"  # as cash counts as a return for its little risk
     assert number(without.sharpe) < -2
+    assert with_rates.baseline == "ew"
     assert with_rates.sharpe == pytest.approx(0, abs=0.1)
     assert with_rates.to_reference == without.to_reference
+    rates = risky(free=0.0002)
+    beside = evidence(rates._replace(baselines={"calm": rates.baselines["calm"]}), "a")
+    assert beside.sharpe == pytest.approx(0, abs=0.1)  # whichever baseline is the best
 
 
 def test_sharpe_ratios_are_pooled():
@@ -125,6 +129,18 @@ def test_sharpe_ratios_are_pooled():
     apart = weights @ [number(one.sharpe_z) for one in each] / math.sqrt(weights @ weights)
     assert apart < number(found.sharpe.z) < -2
     assert found.sharpe.positive == 0
+
+
+def test_a_table_of_four_years_counts_twice_as_much_as_one_of_a_year():
+    """Without common days, z is (1 · z₁ + 2 · z₂) / √5."""
+    rng = np.random.default_rng(3)
+    tables = {
+        "short": made_up(rng, 252, -2e-4, "2001-01-01"),
+        "long": made_up(rng, 4 * 252, 3e-4, "2011-01-03"),
+    }
+    found = pool(tables, ["tilts"])["tilts"]
+    short, long = (number(found.evidence[name].to_reference.z) for name in tables)
+    assert number(found.to_reference.z) == pytest.approx((short + 2 * long) / math.sqrt(5))
 
 
 def test_correlations_come_from_common_days():

@@ -39,10 +39,11 @@ def whole_shares(
         )
         return number * lots
     low, high = np.floor(ideal + EXACT), np.ceil(ideal - EXACT)
-    turned = (shares < 0) & (shares + ideal < EXACT) & (shares + high > EXACT)
+    goal = shares + ideal
+    turned = (shares < 0) & (goal < EXACT) & (shares + high > EXACT)
     high = np.where(turned, np.maximum(low, high - 1), high)  # what is short is not bought long, …
-    least = np.minimum(shares + ideal, 0.0)  # … and a holding not sold short, by rounding
-    low = np.where(shares + low < least - EXACT, np.minimum(high, low + 1), low)
+    sold = (goal > -EXACT) & (shares + low < -EXACT)  # … and a holding not sold short, by rounding
+    low = np.where(sold, np.minimum(high, low + 1), low)
     least_cash = min(cash, 0.0)
 
     def searched(start: np.ndarray) -> np.ndarray:

@@ -114,6 +114,25 @@ def test_skewness_and_kurtosis_by_hand() -> None:
     assert test.kurtosis == pytest.approx(21 / 9)
 
 
+def test_sharpe_ratios_and_their_moments_leave_out_what_cash_earns() -> None:
+    """Of returns over cash: one day of +3 among three of −1, and the same with a day of +4."""
+    free = np.repeat([0.0, 0.01, 0.03, 0.002], 5)
+    one, other = (np.tile([[best, -0.01, -0.01, -0.01]], 5) for best in (0.03, 0.04))
+    zeros = np.zeros((1, 20))
+    entries = {
+        "equal weight": ("baseline", one + free, zeros, zeros),
+        "mine": ("strategy", other + free, zeros, zeros),
+    }
+    result = assessed(entries, days(20), resamples=10, risk_free=free)
+    base, mine = result.strategies["equal weight"], result.strategies["mine"]
+    assert base.sharpe_test.skewness == pytest.approx(6 / 3**1.5)
+    assert base.sharpe_test.kurtosis == pytest.approx(21 / 9)
+    assert base.sharpe_test.ratio == pytest.approx(0, abs=1e-9)
+    # A mean of 0.25 over deviations of 3.75 and three of −1.25: a variance of 93.75 / 19.
+    assert mine.to_reference is not None
+    assert mine.to_reference.sharpe.value == pytest.approx(0.25 / (93.75 / 19) ** 0.5 * 252**0.5)
+
+
 def test_order_of_seeds_changes_nothing() -> None:
     rng = np.random.default_rng(10)
     base, agent = (

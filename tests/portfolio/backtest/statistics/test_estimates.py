@@ -55,6 +55,15 @@ def test_the_error_by_hand() -> None:
     assert high - found.value == pytest.approx(4.302653 * found.error)  # t of 2 degrees
 
 
+def test_a_difference_in_volatility_has_slow_transforms_only() -> None:
+    """Ten years of 12 months: ν is 8, where that of growth is ⌊0.41 · 120^⅔⌋ = 9; of 2 years, 2."""
+    rng = np.random.default_rng(0)
+    for months, slow in ((120, 8), (24, 2)):
+        found = estimate(*rng.normal(0, 0.1, (2, 1, months)), 12)
+        assert len(found["growth"].loads) == int(0.41 * months ** (2 / 3))
+        assert len(found["volatility"].loads) == slow
+
+
 def test_independent_days_have_the_usual_error() -> None:
     rng = np.random.default_rng(1)
     ratios = []
