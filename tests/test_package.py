@@ -62,7 +62,7 @@ WRONG_TYPES = {
     "train(Pendulum(), DQN, episodes=1)": "agent is <class 'qfoli",
     "train(Pendulum(), DQN(), episodes='3')": "episodes is '3'; it must be a whole number.",
     "train(Pendulum(), DQN(), episodes=1, executor=3)": "executor is 3; it must be text such as",
-    "train(Pendulum(), DQN(), episodes=1, executor='two')": "--on is 'two'; it must be here,",
+    "train(Pendulum(), DQN(), episodes=1, executor='two')": "'two' names no executor; it must be",
     "train(Pendulum(), DQN(), episodes=1, seeds=True)": "seeds is True; it must be a whole",
     "train(Pendulum(), DQN(), episodes=1, out=3)": "out is 3; it must be a path, such as",
     "Run.create(Pendulum(), DQN(), budget=3)": "budget is 3; it must be a budget, such as",

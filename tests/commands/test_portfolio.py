@@ -280,8 +280,8 @@ def test_the_check_of_prices_guesses_at_splits_and_escapes_names(monkeypatch, ca
         (["--set", "dqm.window=2"], "no agent is named dqm; did you mean"),
         (["--train", "20d"], "a longer --train in a backtest), or lower window or horizon"),
         (["--seeds", "0"], "seeds is 0"), (["--cost-bps", "-5"], "--cost-bps is -5"),
-        (["--on", "procesess:4"], "--on is 'procesess:4'; it must be here, processes:4"),
-        (["--on", "processes:0"], "--on is 'processes:0'; give a number of processes"),
+        (["--on", "procesess:4"], "'procesess:4' names no executor; it must be here, processes:4"),
+        (["--on", "processes:0"], "'processes:0' names no executor; give a number of processes"),
     ],
 )  # fmt: skip
 def test_backtests_that_are_refused(monkeypatch, capsys, tmp_path, options, message):

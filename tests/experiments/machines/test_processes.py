@@ -30,8 +30,8 @@ def begun(*files):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("procesess:4", "--on is 'procesess:4'; it must be here, processes:4"),
-        ("processes:0", "--on is 'processes:0'; give a number of processes from 1 to 1024"),
+        ("procesess:4", "'procesess:4' names no executor; it must be here, processes:4"),
+        ("processes:0", "'processes:0' names no executor; give a number of processes from 1"),
         ("processes", "a number of processes"), ("processes:two", "a number of processes"),
         ("processes:-1", "a number of processes"), ("processes:9999", "from 1 to 1024"),
         ("", "it must be here"), ("ray:", "it must be here"), ("here:1", "it must be here"),

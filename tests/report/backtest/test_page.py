@@ -156,7 +156,7 @@ def test_calls_nothing_a_limit_that_the_backtest_may_replace(data: BacktestData)
     }
     page = Page(render_backtest(replace(data, config={**data.config, "mandate": mandate})))
     limits = "trading.turnover = 0.4; risk.tracking_error = 0.05; risk.benchmark = SPY"
-    assert f"Every order obeys these limits: {limits}." in page.text
+    assert f"Every order of an agent or a baseline obeys these limits: {limits}." in page.text
 
 
 def test_table_has_every_figure_with_its_intervals(data: BacktestData) -> None:

@@ -40,9 +40,10 @@ def on(text: Executor | str | None) -> Executor:
         return Ray(text if rest else None)
     if kind == "processes":
         raise QfolioError(
-            f"--on is {text!r}; give a number of processes from 1 to {MOST}, such as processes:4."
+            f"{text!r} names no executor; give a number of processes from 1 to {MOST}, such as "
+            "processes:4."
         )
     raise QfolioError(
-        f"--on is {text!r}; it must be here, processes:4 (or another number), ray or "
+        f"{text!r} names no executor; it must be here, processes:4 (or another number), ray or "
         "ray://HOST:10001."
     )
