@@ -18,6 +18,13 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
+def _not_opened(where: str) -> QfolioError:
+    return QfolioError(
+        f"No window can be opened {where}; correct DISPLAY or WAYLAND_DISPLAY, or unset them and "
+        "write a GIF with qfolio watch DIR."
+    )
+
+
 class Window:
     """Shows pendulum episodes in real time; closing it does not stop the training.
 
@@ -36,18 +43,12 @@ class Window:
         try:
             self._env.reset(seed=0)
         except pygame.error as error:
-            raise QfolioError(
-                f"No window can be opened here ({error}); leave out --live, or use a machine with "
-                "a display."
-            ) from None
+            raise _not_opened(f"here ({error})") from None
         driver = pygame.display.get_driver()
         if driver in ("dummy", "offscreen") and os.environ.get("SDL_VIDEODRIVER") != driver:
             # SDL falls back to these if the display does not answer.
             display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-            raise QfolioError(
-                f"No window can be opened on display {display}; correct DISPLAY or "
-                "WAYLAND_DISPLAY, or unset them and write a GIF with qfolio watch DIR."
-            )
+            raise _not_opened(f"on display {display}")
         self.caption(caption)
 
     def caption(self, text: str) -> None:
