@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
-from qfolio.core.evaluation import evaluate, play, start_keys, step_key, tail_steps
+from qfolio.core.evaluation import evaluate, greedy_episode, start_keys, step_key, tail_steps
 from qfolio.core.mdp import Step
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.tasks.pendulum import Pendulum
@@ -123,10 +123,11 @@ def test_few_starts_are_the_first_of_many():
     np.testing.assert_array_equal(few, many[:3])
 
 
-def test_play_is_what_evaluate_counts():
-    task, agent = Pendulum(horizon=50), DQN()
+@pytest.mark.parametrize("task", [Pendulum(horizon=50), Ar1(menu="grid:10", horizon=50)])
+def test_greedy_episode_is_what_evaluate_counts(task):
+    agent = DQN()
     weights = agent.init(task, jax.random.key(0)).online
-    episode = play(task, agent, weights, start_keys(2)[1])
+    episode = greedy_episode(task, agent, weights, start_keys(2)[1])
     returns = evaluate(task, agent, weights, start_keys(2), 0).returns
-    assert episode.states.theta.shape == (51,)
+    assert jax.tree.leaves(episode.states)[0].shape == (51,)
     np.testing.assert_allclose(episode.rewards.sum(), returns[1], rtol=1e-5)

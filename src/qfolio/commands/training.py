@@ -206,7 +206,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
     from qfolio.core.files import write_bytes
     from qfolio.experiments.run import Run
     from qfolio.report.animation import pendulum_gif
-    from qfolio.report.collect import EPISODE_START, greedy_episode
+    from qfolio.report.collect import EPISODE_START, pendulum_episode
     from qfolio.tasks.pendulum import Pendulum
 
     run = Run.open(folder)
@@ -217,12 +217,12 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
     if has_display():
         window = Window(f"qfolio: {folder}")
         for number in range(episodes):
-            episode = greedy_episode(run, run.task, (EPISODE_START + number) % STARTS)
+            episode = pendulum_episode(run, run.task, (EPISODE_START + number) % STARTS)
             if not window.show(episode.states, episode.torques):
                 break
         window.close()
         return
-    episode = greedy_episode(run, run.task)
+    episode = pendulum_episode(run, run.task)
     path = folder / "episode.gif"
     write_bytes(path, pendulum_gif(episode.states, episode.torques, episode.rewards))
     say(f"There is no display here; the episode is in {path}")
@@ -398,7 +398,7 @@ def _window(live: bool) -> Iterator[Callable[["Run"], None] | None]:
         return
     if not has_display():
         raise QfolioError("--live needs a display; without one, qfolio watch DIR writes a GIF.")
-    from qfolio.report.collect import greedy_episode
+    from qfolio.report.collect import pendulum_episode
     from qfolio.tasks.pendulum import Pendulum
 
     window = Window()
@@ -406,7 +406,7 @@ def _window(live: bool) -> Iterator[Callable[["Run"], None] | None]:
     def show(run: "Run") -> None:
         window.caption(f"qfolio: after {run.episodes:,} episodes")
         assert isinstance(run.task, Pendulum)
-        episode = greedy_episode(run, run.task)
+        episode = pendulum_episode(run, run.task)
         window.show(episode.states, episode.torques)
 
     try:

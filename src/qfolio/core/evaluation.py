@@ -96,10 +96,15 @@ def greedy(task: Task, agent: Agent, weights: PyTree) -> Policy:
     """An agent's greedy policy, as a function from a state to the intended action."""
 
     def policy(state: PyTree) -> Array:
-        view = jax.tree.map(lambda x: x[None], task.observe(state))
-        return task.intent(state, agent.policy(weights, view)[0])
+        return task.intent(state, _action(task, agent, weights, state))
 
     return policy
+
+
+def _action(task: Task, agent: Agent, weights: PyTree, state: PyTree) -> Array:
+    """The agent's greedy action in one state."""
+    view = jax.tree.map(lambda x: x[None], task.observe(state))
+    return agent.policy(weights, view)[0]
 
 
 class Episode(NamedTuple):
@@ -110,11 +115,11 @@ class Episode(NamedTuple):
     rewards: Float[Array, " time"]
 
 
-def play(task: Task, agent: Agent, weights: PyTree, key: PRNGKeyArray) -> Episode:
+def greedy_episode(task: Task, agent: Agent, weights: PyTree, key: PRNGKeyArray) -> Episode:
     """One greedy episode from the start state of ``key``, over the whole horizon of the task."""
 
     def step(state: PyTree, time: Array) -> tuple[PyTree, tuple]:
-        action = agent.policy(weights, task.observe(state)[None])[0]
+        action = _action(task, agent, weights, state)  # a step takes it, not its intent
         after = task.step(state, action, step_key(key, time))
         return after.state, (after.state, action, after.reward)
 

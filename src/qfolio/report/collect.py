@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from qfolio.core.arrays import Floats
-from qfolio.core.evaluation import greedy, play, start_keys
+from qfolio.core.evaluation import greedy, greedy_episode, start_keys
 from qfolio.core.mdp import Agent, Box, Policy, Position
 from qfolio.core.training import episode_steps
 from qfolio.experiments.grading import curve_optimum
@@ -61,7 +61,7 @@ def report_data(
         training_returns=episodes.column("return"),
         optimum=np.nan if best is None else best,
         maps=_maps(run, pendulum, exact) if pendulum and exact else None,
-        episode=greedy_episode(run, pendulum) if pendulum else None,
+        episode=pendulum_episode(run, pendulum) if pendulum else None,
         market=_market(run, summary, known) if known else None,
         unit=unit,
         preset=name,
@@ -69,10 +69,10 @@ def report_data(
     )
 
 
-def greedy_episode(run: Run, task: Pendulum, start: int = EPISODE_START) -> Episode:
+def pendulum_episode(run: Run, task: Pendulum, start: int = EPISODE_START) -> Episode:
     """The first seed's greedy episode from a fixed start."""
     weights = run.first_weights()
-    episode = jax.jit(lambda: play(task, run.agent, weights, start_keys()[start]))()
+    episode = jax.jit(lambda: greedy_episode(task, run.agent, weights, start_keys()[start]))()
     return Episode(
         states=np.stack([episode.states.theta, episode.states.theta_dot], axis=-1),
         torques=np.asarray(task.torque(episode.actions)),
