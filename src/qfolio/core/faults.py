@@ -177,7 +177,7 @@ def _until_wrong(
     def train(state: TrainingState) -> tuple[TrainingState, Checked]:
         before = state.tally.steps
         state, rollout = play(task, agent, state)
-        state, _, _ = absorb(task, agent, state, rollout, learning=learning)
+        state, _ = absorb(task, agent, state, rollout, learning=learning)
         state = eqx.tree_at(lambda s: s.healthy, state, healthy(agent, state))
         return state, _checked(task, rollout, before)
 

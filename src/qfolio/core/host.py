@@ -325,7 +325,7 @@ class HostPopulation(Population):
             task: Task, agent: Agent, carry: PyTree, rollout: Transition, seen: Array, row: Array
         ) -> tuple[PyTree, Array]:
             state, records = jax.tree.unflatten(form, carry)
-            state, record, _ = absorb(task, agent, state, rollout, learning=learning)
+            state, record = absorb(task, agent, state, rollout, learning=learning)
             put = lambda all, some: lax.dynamic_update_slice_in_dim(all, some, row, 0)  # noqa: E731
             carry = jax.tree.leaves((state, jax.tree.map(put, records, record)))
             return carry, act(task, agent, carry, seen, jnp.int32(0))

@@ -92,13 +92,13 @@ def advance(
     """
     length = agent.rollout_steps
     rollout = jax.jit(partial(_rollout, task, agent, learning=learning), inline=True)
-    _, record, _ = jax.eval_shape(rollout, state)  # traced once, here and below
+    _, record = jax.eval_shape(rollout, state)  # traced once, here and below
     rows = chunk_steps(task, agent)
     empty = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape[1:]), x.dtype), record)
 
     def body(i: Array, carry: tuple[TrainingState, Episodes]) -> tuple[TrainingState, Episodes]:
         state, episodes = carry
-        state, record, _ = rollout(state)
+        state, record = rollout(state)
         put = lambda all, some: lax.dynamic_update_slice_in_dim(all, some, i * length, 0)  # noqa: E731
         return state, jax.tree.map(put, episodes, record)
 
@@ -126,7 +126,7 @@ def episode_steps(task: Task, agent: Agent) -> int:
 
 def _rollout(
     task: Task, agent: Agent, state: TrainingState, *, learning: bool
-) -> tuple[TrainingState, Episodes, Metrics]:
+) -> tuple[TrainingState, Episodes]:
     """One rollout, then learning from it; the records have a leading time axis."""
     return absorb(task, agent, *play(task, agent, state), learning=learning)
 
@@ -173,7 +173,7 @@ def step_keys(key: UInt32[Array, "2"], time: Array) -> Key[Array, "4"]:
 
 def absorb(
     task: Task, agent: Agent, state: TrainingState, rollout: Transition, *, learning: bool
-) -> tuple[TrainingState, Episodes, Metrics]:
+) -> tuple[TrainingState, Episodes]:
     """Learns from a rollout, or only stores it, and updates the counts."""
     if learning:
         last = state.steps + agent.rollout_steps - 1
@@ -209,7 +209,7 @@ def absorb(
         episodes=state.episodes + records.finished.sum(dtype=jnp.int32),
         healthy=state.healthy & jnp.stack([jnp.array(True), *finite]).all(),
     )
-    return state, records, metrics
+    return state, records
 
 
 def _scan(function: Callable[..., Any], carry: Any, xs: Any) -> tuple[Any, Any]:
