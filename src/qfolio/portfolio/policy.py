@@ -338,7 +338,7 @@ class Policy:
         decision.
         """
         task = on_table(self.task, prices)
-        task = task.filling(1) if whole else task
+        task = task.filled_at_once() if whole else task
         start = begin(task, held[None], spent)
         found, after = follow(task, self.agent, self.members, first, start, count, together=True)
         both = (np.asarray(x[0], float) for x in (found, after.weights))

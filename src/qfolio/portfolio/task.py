@@ -300,12 +300,12 @@ class Portfolio(Market):
             1 / margin if margin else np.inf,
         )
 
-    def filling(self, rows: int) -> "Portfolio":
-        """The same task with orders filled over a given number of rows."""
-        if self.terms.fill == rows:
+    def filled_at_once(self) -> "Portfolio":
+        """The same task with every order filled in one row."""
+        if self.terms.fill == 1:
             return self
         assets, mandate = parse(self.mandate)
-        trading = msgspec.structs.replace(mandate.trading, fill=rows)
+        trading = msgspec.structs.replace(mandate.trading, fill=1)
         text = msgspec.structs.replace(mandate, trading=trading).text(assets)
         return dataclasses.replace(self, mandate=text)
 

@@ -72,7 +72,7 @@ def reasons(
     change = (allocation.weights - allocation.held)[1:]
     held = jnp.asarray(allocation.held[None], jnp.float32)
     row = jnp.array([len(prices) - 1], jnp.int32)
-    task, used = on_table(policy.task, prices).filling(1), jnp.asarray(spent, jnp.float32)
+    task, used = on_table(policy.task, prices).filled_at_once(), jnp.asarray(spent, jnp.float32)
     allowed, nearest = _allowed(task, row[0], held[0], used)
     required = (np.asarray(nearest, float) - allocation.held)[1:]
     bounds = _bounds(allowed, allocation.weights, allocation.held)

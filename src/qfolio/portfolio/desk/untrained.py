@@ -137,7 +137,7 @@ class Ordered(Untrained):
                 f"The backtest knows only the {own.kind} of {name}, not its weights, so that it "
                 "cannot be followed; follow another strategy, or run a backtest with its weights."
             )
-        super().__init__(name, assets, task.filling(1), cap)
+        super().__init__(name, assets, task.filled_at_once(), cap)
         self.own = own
 
     def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:
