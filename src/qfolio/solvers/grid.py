@@ -45,7 +45,7 @@ class GridOptimum:
         """Undiscounted returns over the task's horizon of the optimal policy, one for each key."""
         starts = jax.vmap(self.task.reset)(keys)
         solve = jax.jit(
-            lambda: self._follow(self._solve(1.0, self.task.horizon), starts),
+            lambda: self._follow(self._solve(), starts),
             compiler_options=OPTIMIZED,
         )
         name = np.asarray(jax.random.key_data(keys)).tobytes()
@@ -97,13 +97,13 @@ class GridOptimum:
         look = lambda action: self._look_ahead(values, points, action, discount)  # noqa: E731
         return lax.map(look, self._actions).reshape(-1, *self._shape)
 
-    def _solve(self, discount: float, steps: int) -> Float[Array, "steps n m"]:
-        """Values with 0, 1, … steps − 1 steps to go."""
+    def _solve(self) -> Float[Array, "steps n m"]:
+        """Undiscounted values with 0, 1, … steps to go, one fewer than the task's horizon."""
 
         def back(values: Array, _: None) -> tuple[Array, Array]:
-            return self._action_values(values, discount).max(0), values
+            return self._action_values(values, 1.0).max(0), values
 
-        return lax.scan(back, jnp.zeros(self._shape), None, length=steps)[1]
+        return lax.scan(back, jnp.zeros(self._shape), None, length=self.task.horizon)[1]
 
     def _follow(self, values: Float[Array, "steps n m"], starts: PyTree) -> Float[Array, " start"]:
         """Returns of the policy that is greedy one exact step ahead of ``values``."""

@@ -49,7 +49,7 @@ class GridPendulum(Pendulum):
         return (angle * self.speeds + speed.clip(0, self.speeds - 1)).astype(jnp.int32)
 
 
-def interpolated(grid: GridOptimum, horizon: int = 200) -> FiniteMDP:
+def interpolated(grid: GridOptimum) -> FiniteMDP:
     """A finite process on the points of a grid, whose values are those of the grid's optimum.
 
     An action moves a point to between four others, and the process goes to each with its
@@ -78,4 +78,4 @@ def interpolated(grid: GridOptimum, horizon: int = 200) -> FiniteMDP:
     successors, weights, rewards = (np.asarray(table) for table in tables)
     weights = weights.astype(float) / weights.sum(-1, keepdims=True, dtype=float)
     assert successors.shape[0] == n * m
-    return FiniteMDP(weights, rewards, horizon=horizon, successors=successors)
+    return FiniteMDP(weights, rewards, horizon=grid.task.horizon, successors=successors)

@@ -30,9 +30,9 @@ def _pathwise(episodes: int, **changes: Any) -> dict[str, Preset]:
     return {"fast": Preset("pathwise", {**_PATHWISE, **changes}, episodes, seeds=5)}
 
 
-def _all_actions(episodes: int, menu: str, **changes: Any) -> dict[str, Preset]:
+def _all_actions(menu: str, **changes: Any) -> dict[str, Preset]:
     changes = {**_DQN, **changes}
-    return {"fast": Preset("dqn", changes, episodes, seeds=5, task={"menu": menu})}
+    return {"fast": Preset("dqn", changes, 8192, seeds=5, task={"menu": menu})}
 
 
 _ON_FACTORS = _pathwise(
@@ -66,7 +66,6 @@ PRESETS: Presets = {
     # Regimes of a hundred steps need a discount near 1. The values of these actions (no order, all
     # in, all out, …) are straight lines in the holding, those of fixed weights have kinks.
     ("market/regime", "dqn"): _all_actions(
-        8192,
         "tilts:0.1",
         batch_size=1024,
         discount=0.99,
@@ -82,9 +81,7 @@ PRESETS: Presets = {
         learning_rate_steps=400.0,
         reward_scale=100.0,
     ),
-    ("market/ar1", "dqn"): _all_actions(
-        8192, "grid:10", batch_size=1024, learning_rate_steps=2016.0
-    ),
+    ("market/ar1", "dqn"): _all_actions("grid:10", batch_size=1024, learning_rate_steps=2016.0),
     # A trade pays off over years, that is, thousands of daily steps: the slopes carry its value
     # beyond the rollout. All gradients are clipped, so that the large first ones, far from the
     # region, do not outweigh the later ones in Adam's mean of squares.
