@@ -1,18 +1,13 @@
 """A return that an AR(1) signal predicts, with proportional costs: dynamic programming."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from qfolio.solvers.shared import gauss, log_remainder, require
-
-LEVELS = tuple(i / 10 for i in range(11))
-"""The weights to choose from in the market ``ar1``."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +27,6 @@ class Ar1Optimum:
     """Best level, as an index."""
     cost: float
     """Proportional cost, one way."""
-    growth_of: Callable[[Int[np.ndarray, "s h"]], float]
-    """Stationary growth a year of any table of actions."""
-
-    @cached_property
-    def growth(self) -> float:
-        """Log growth of the best policy, a year; at high costs it takes minutes."""
-        return self.growth_of(self.actions)
 
     def policy(self, x: ArrayLike, weight: ArrayLike) -> Int[np.ndarray, "..."]:
         """Index of the best level at any signal x and weight held; both broadcast."""
@@ -55,7 +43,7 @@ def ar1(
     slope: float = 0.004,
     volatility: float = 0.01,
     cost: float = 0.002,
-    levels: ArrayLike = LEVELS,
+    levels: ArrayLike = tuple(i / 10 for i in range(11)),
     discount: float = 0.97,
     signal_points: int | None = None,
     holding_parts: int = 4,
@@ -71,7 +59,7 @@ def ar1(
     Value iteration on (signal, weight): the expectation over x' is a sum over equally spaced
     signals within five standard deviations (exact to rounding for smooth functions), and that over
     η is Gauss–Hermite quadrature; values between grid weights are interpolated. Values are exact to
-    about 1e-6, growth to about 2e-5 a year at the default grids.
+    about 1e-6 at the default grids.
 
     Args:
         rho, noise: Parameters of the signal; |rho| < 1, noise > 0.
@@ -138,23 +126,4 @@ def ar1(
     value += (low + high) / 2
     after = look_ahead(value)
     actions = (trade + after[:, None, :]).argmax(-1)
-
-    def growth_of(actions: Int[np.ndarray, "s h"]) -> float:
-        """Stationary growth a year, starting in cash, by following the distribution of states."""
-        states = np.zeros((len(x), len(holdings)))
-        states[:, 0] = np.exp(-((x / spread) ** 2) / 2)
-        states /= states.sum()
-        s, h = np.indices(states.shape)
-        earned = trade[h, actions] + reward[s, actions]
-        places = (row * len(holdings) + np.stack([cell, cell + 1])).ravel()
-        shares = np.stack([1 - share, share])
-        for _ in range(100_000):
-            chosen = np.bincount((s * len(b) + actions).ravel(), states.ravel(), reward.size)
-            mass = chosen.reshape(reward.shape)[..., None] * chances
-            moved = np.bincount(places, (mass * shares).ravel(), states.size)
-            before, states = states, transition.T @ moved.reshape(states.shape)
-            if np.abs(states - before).max() < 1e-12:
-                break
-        return 252 * float((states * earned).sum())  # steps in a year
-
-    return Ar1Optimum(x, holdings, b, value, after, actions, cost, growth_of)
+    return Ar1Optimum(x, holdings, b, value, after, actions, cost)
