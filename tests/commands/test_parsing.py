@@ -19,7 +19,7 @@ from tyro.conf import Positional
 import qfolio
 from qfolio.cli import commands
 from qfolio.commands import console
-from qfolio.commands.arguments import new_folder
+from qfolio.commands.arguments import fresh_name
 from qfolio.commands.parsing import Document, Failed, description, example, grouped
 from qfolio.core.registry import TASKS
 
@@ -85,7 +85,7 @@ def test_every_option_is_in_a_group(name):
 
 
 def test_commands_of_the_same_second_have_folders_of_their_own():
-    names = {new_folder("market/kelly", "dqn").as_posix() for _ in range(20)}
+    names = {fresh_name("market/kelly", "dqn").as_posix() for _ in range(20)}
     assert len(names) > 15
     assert all(re.fullmatch(r"runs/market-kelly-dqn-\d{8}-\d{6}-[0-9a-f]{4}", x) for x in names)
 

@@ -60,7 +60,7 @@ def budget_of(episodes: int | None, steps: int | None) -> Budget | None:
     return None if episodes is None and steps is None else Budget(episodes, steps)
 
 
-def new_folder(*words: str) -> Path:
+def fresh_name(*words: str) -> Path:
     """A folder in runs/ that is named by the words, such as task and agent, and the time.
 
     Four random digits tell it from that of a command that starts in the same second.
@@ -81,7 +81,7 @@ def executor_of(
     from qfolio.experiments.machines.choice import on as chosen
 
     if resumed is None:
-        require_new(out or new_folder("run"), option)
+        require_new(out or fresh_name("run"), option)
     return chosen(on)
 
 

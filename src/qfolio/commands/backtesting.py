@@ -20,7 +20,7 @@ from qfolio.commands.arguments import (
     Trackers,
     continues,
     executor_of,
-    new_folder,
+    fresh_name,
     sources,
     typed,
 )
@@ -127,7 +127,7 @@ class Options(Reading):
 
     def folder(self, kind: str) -> Path:
         """The path of the new folder: ``out``, or runs/KIND-TIME."""
-        return self.out or new_folder(kind)
+        return self.out or fresh_name(kind)
 
     def presets(self) -> "dict[str, Preset]":
         """The agents by their names in tables, with all settings; imports their modules."""

@@ -14,7 +14,7 @@ from qfolio.commands.arguments import (
     budget_of,
     continues,
     executor_of,
-    new_folder,
+    fresh_name,
     prepare,
     typed,
 )
@@ -93,7 +93,7 @@ def compare(
             if budget is None
             else "The length of training was set by hand; learning-rate schedules and the like "
             "were tuned for the presets' own lengths.",
-            out=out or new_folder(task, "comparison"),
+            out=out or fresh_name(task, "comparison"),
         )
     else:
         run = Comparison.open(resume)

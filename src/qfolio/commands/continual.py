@@ -13,7 +13,7 @@ from qfolio.commands.arguments import (
     Name,
     Trackers,
     continues,
-    new_folder,
+    fresh_name,
     prepare,
     typed,
 )
@@ -91,7 +91,7 @@ def continual(
         options: dict[str, Any] = {k: x for k, x in shares.items() if x is not None}
         options |= {} if seed is None else {"seed": seed}
         plan = _plan(task, change, agent, preset, episodes, seeds, assignments, options)
-        folder = out or new_folder(task, "continual")
+        folder = out or fresh_name(task, "continual")
         continual.create(plan, folder, typed())
     else:
         folder, plan = resume, continual.read(resume).plan()

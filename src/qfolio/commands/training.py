@@ -17,7 +17,7 @@ from qfolio.commands.arguments import (
     budget_of,
     continues,
     executor_of,
-    new_folder,
+    fresh_name,
     prepare,
     training_command,
 )
@@ -112,7 +112,7 @@ def train(
         if resume is None:
             task, preset = task or "pendulum", "fast" if preset is None else preset
             agent = agent or presets.default_agent(task)
-            folder = out or new_folder(task, registry.short(agent), preset)
+            folder = out or fresh_name(task, registry.short(agent), preset)
             chosen = settings.parse(assignments)
             run = _new_run(task, agent, preset, budget, seeds, seed or 0, folder, chosen)
         elif task is not None or not continues("episodes", "steps", "compare", "live"):

@@ -15,7 +15,7 @@ from qfolio.commands.arguments import (
     budget_of,
     continues,
     executor_of,
-    new_folder,
+    fresh_name,
     prepare,
     training_command,
 )
@@ -197,7 +197,7 @@ def _new(
         batch=16 if batch is None else batch,
         fresh_seeds=preset.seeds,
         preset=preset_name,
-        out=out or new_folder("tune", task_name, registry.short(agent_name)),
+        out=out or fresh_name("tune", task_name, registry.short(agent_name)),
     )
 
 
