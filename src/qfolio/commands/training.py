@@ -112,16 +112,16 @@ def train(
         if resume is None:
             task, preset = task or "pendulum", "fast" if preset is None else preset
             agent = agent or presets.default_agent(task)
-            folder = out or fresh_name(task, registry.short(agent), preset)
+            place = out or fresh_name(task, registry.short(agent), preset)
             chosen = settings.parse(assignments)
-            run = _new_run(task, agent, preset, budget, seeds, seed or 0, folder, chosen)
+            run = _new_run(task, agent, preset, budget, seeds, seed or 0, place, chosen)
         elif task is not None or not continues("episodes", "steps", "compare", "live"):
             raise QfolioError(
                 "--resume keeps the run's settings; add only --episodes or --steps, --on, --track, "
                 "--trust, --no-compare or --live."
             )
         else:
-            run, folder = Run.open(resume), resume
+            run = Run.open(resume)
             if live:
                 _require_seen(run.config.task)
         budget = budget or run.budget
@@ -132,7 +132,7 @@ def train(
                 f"Nothing is left to train: each seed has had {trained} already; set a larger "
                 f"total with --{budget.unit}."
             )
-        command = _resume(run, folder, on, compare or contrast_of(run.agent) is None)
+        command = _resume(run, on, compare or contrast_of(run.agent) is None)
         with resumable(command), tracked(*following):
             _train(run, budget, executor, show)
     if run.interrupted:
@@ -142,12 +142,12 @@ def train(
         if compare:
             try:
                 with lasting():  # whose end is not that of the run
-                    contrast = _contrast(run, folder, executor)
+                    contrast = _contrast(run, executor)
             except QfolioError as error:  # the grade and the report do not need it
                 console.say(f"The training for contrast is left out. {error}")
         if contrast is not None and contrast.interrupted:
             stop(command)
-        return outcome(folder, _finish(run, folder, contrast))
+        return _finish(run, contrast)
 
 
 train.__doc__ = (train.__doc__ or "").replace("{markets}", listed(registry.of("market"), "or"))
@@ -282,7 +282,7 @@ def _train(
         run.train(budget, [RunProgress(run, optimum, update, show)])
 
 
-def _contrast(run: "Run", folder: Path, executor: "Executor") -> "Run | None":
+def _contrast(run: "Run", executor: "Executor") -> "Run | None":
     """The training of the report's variant, with one setting changed; resumable, too."""
     from qfolio.commands.console import say
     from qfolio.experiments.run import Run
@@ -292,7 +292,8 @@ def _contrast(run: "Run", folder: Path, executor: "Executor") -> "Run | None":
     variant = contrast_of(run.agent)
     if variant is None:
         return None
-    place = folder / CONTRAST
+    assert run.folder is not None
+    place = run.folder / CONTRAST
     if (place / CHECKPOINT).exists():
         contrast = Run.open(place)
     else:
@@ -330,18 +331,19 @@ def write_again(folder: Path) -> None:
     path = folder / "summary.json"
     summary = read_json(path) if path.is_file() else {}
     if summary.get("episodes") != run.episodes:
-        raise QfolioError(f"The run is not finished; continue with {_resume(run, folder)}.")
+        raise QfolioError(f"The run is not finished; continue with {_resume(run)}.")
     write_report(folder, report_data(run, summary, contrast, _command(run, contrast)))
 
 
-def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
+def _finish(run: "Run", contrast: "Run | None") -> Document:
     from qfolio.commands.console import say, working
     from qfolio.commands.console.training import print_result, print_rule
     from qfolio.experiments.budget import unlearned
     from qfolio.report.collect import report_data
     from qfolio.report.training import write_report
 
-    starts = run.population.starts
+    folder, starts = run.folder, run.population.starts
+    assert folder is not None
     with working(f"Grading on {starts:,} start states and writing the report"):
         summary = run.summary()
         write_report(folder, report_data(run, summary, contrast, _command(run, contrast)))
@@ -356,13 +358,13 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
         f"{summary['seconds_compile']:.1f} s of compiling."
     )
     say(f"Report: {folder / PAGE}")
-    return summary
+    return outcome(folder, summary)
 
 
-def _resume(run: "Run", folder: Path | None, on: str = "here", compare: bool = True) -> str:
-    assert folder is not None
+def _resume(run: "Run", on: str = "here", compare: bool = True) -> str:
+    assert run.folder is not None
     command = "qfolio train --resume" if compare else "qfolio train --no-compare --resume"
-    return again(command, folder, run.task, run.agent, on=on)
+    return again(command, run.folder, run.task, run.agent, on=on)
 
 
 def _command(run: "Run", contrast: "Run | None") -> str:
@@ -372,7 +374,7 @@ def _command(run: "Run", contrast: "Run | None") -> str:
 
     config = run.config
     compare = contrast is not None or contrast_of(run.agent) is None
-    resume = _resume(run, run.folder, compare=compare)
+    resume = _resume(run, compare=compare)
     found = changes(config, type(run.task))
     if found is None:
         return resume
