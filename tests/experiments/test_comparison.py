@@ -37,7 +37,7 @@ from qfolio.experiments.presets import PRESETS, Preset
 from qfolio.experiments.run import Run
 from qfolio.portfolio.synthetic.kelly import Kelly
 from qfolio.portfolio.synthetic.regime import Regime
-from qfolio.report.comparison import comparison_data, render_comparison, tidy
+from qfolio.report.comparison import comparison_data, render_comparison
 from qfolio.report.figures.style import percent_tick
 from qfolio.tasks.catch import Catch
 from qfolio.tasks.pendulum import Pendulum
@@ -662,12 +662,6 @@ def test_reports_of_hard_cases():
     text = page(unknown)
     assert "No exact optimum is known here" in text
     assert "Regret" not in text
-
-
-def test_tidy_leaves_names_alone():
-    text = tidy("double-q-2 is at −0.40% after 51,200 steps, q-learning 3,4")
-    assert text.startswith("double-q-2 is at \N{MINUS SIGN}0.40% after 51")
-    assert text.endswith("q-learning 3,4")
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from qfolio.portfolio.synthetic.base import OneAsset, Synthetic
 from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.report.contrast import contrast_of
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
+from qfolio.report.rendering import typeset
 from qfolio.report.words import agent_name, words_of
 from qfolio.solvers.followed import FollowedOptimum
 from qfolio.solvers.grid import GridOptimum
@@ -177,7 +178,7 @@ def responses(
 
     learned = jax.jit(jax.vmap(lambda weights: table(greedy(task, agent, weights))))
     return Responses(
-        scenes=tuple(scene.format(name.replace("-", "\N{MINUS SIGN}")) for name in names),
+        scenes=tuple(scene.format(typeset(name)) for name in names),
         held=np.asarray(held),
         exact=np.asarray(jax.jit(lambda: table(best))()),
         learned=np.asarray(learned(members)),

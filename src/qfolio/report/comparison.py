@@ -6,7 +6,6 @@ All data is in comparison.json, so the report can be rewritten from it.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,6 +47,7 @@ from qfolio.report.rendering import (
     percent,
     render,
     setting_groups,
+    typeset,
 )
 from qfolio.report.words import words_of
 
@@ -85,7 +85,7 @@ class ComparisonData:
 
     def write(self, value: float) -> str:
         """A regret or a return as text."""
-        return tidy(share(value) if self.graded else four_digits(value))
+        return typeset(share(value) if self.graded else four_digits(value))
 
 
 def comparison_data(content: dict[str, Any]) -> ComparisonData:
@@ -123,8 +123,8 @@ def render_comparison(data: ComparisonData) -> str:
         starts=data.starts,
         curve_starts=next(iter(data.results.values())).curve_starts,
         title=f"{counted(len(data.results), 'agent')} {words_of(content['task']).where}",
-        lede=[tidy(sentence) for sentence in content["conclusion"]],
-        notes=[tidy(sentence) for sentence in content["notes"]],
+        lede=[typeset(sentence) for sentence in content["conclusion"]],
+        notes=[typeset(sentence) for sentence in content["notes"]],
         looks=data.looks,
         intervals=ranking["seeds"] >= FEWEST_SEEDS,
         fewest=FEWEST_SEEDS,
@@ -282,12 +282,6 @@ def _middles(data: ComparisonData) -> AnyFloats:
 # Text ----------------------------------------------------------------------------------------
 
 
-def tidy(text: str) -> str:
-    """A sentence with typographic minus signs and apostrophes, as elsewhere on the page."""
-    text = re.sub(r"(?<![\w.])-(?=\d)", "\N{MINUS SIGN}", text.replace("'", "’"))
-    return re.sub(r"(?<=\d) (?=s\b)", THIN_SPACE, text)
-
-
 def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
     """Return the key figures: name, value and a remark."""
     ranking, results = data.ranking, data.results
@@ -301,7 +295,7 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
         facts.append(
             (
                 "Exact optimum",
-                tidy(four_digits(optimum)),
+                typeset(four_digits(optimum)),
                 f"on {number(data.starts, 0)} fixed starts",
             )
         )
@@ -316,7 +310,7 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
         (steps, frugal), (seconds, quick) = (least(arrivals, key) for key in ("steps", "seconds"))
         facts += [
             (f"Fewest steps to {near}", rendering.large(steps), who(frugal)),
-            (f"Least time to {near}", tidy(span(seconds)), f"{who(quick)}, a seed"),
+            (f"Least time to {near}", typeset(span(seconds)), f"{who(quick)}, a seed"),
         ]
     total = sum(result.seconds_train for result in results.values())
     facts.append(("Training, in all", duration(total), "all agents and seeds"))
@@ -348,7 +342,7 @@ def _reached(data: ComparisonData, name: str) -> list[tuple[str, str]]:
         (data.write(final["worst"]), ""),
         ("not reached" if near["steps"] is None else rendering.large(near["steps"]),
          f"{near['reached']} of {seeds} seeds"),
-        ("–" if near["seconds"] is None else tidy(span(near["seconds"])), ""),
+        ("–" if near["seconds"] is None else typeset(span(near["seconds"])), ""),
         (data.write(agent["area"]["iqm"]), interval(agent["area"]["interval"])),
     ]  # fmt: skip
 
@@ -358,7 +352,7 @@ def _took(result: Result) -> list[str]:
     operations = result.operations_per_step
     return [
         rendering.large(result.env_steps),
-        tidy(span(result.seconds_per_seed)),
+        typeset(span(result.seconds_per_seed)),
         rendering.large(result.steps_per_second),
         "–" if operations is None else _scaled(operations, ("", "k", "M", "G")),
         _scaled(result.state_bytes, ("B", "kB", "MB", "GB")),

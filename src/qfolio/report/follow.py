@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from qfolio.report import palette
-from qfolio.report.comparison import tidy
 from qfolio.report.figures.style import NARROW, legend_above, new_figure, svgs
-from qfolio.report.rendering import number, percent, render
+from qfolio.report.rendering import number, percent, render, typeset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,7 +56,7 @@ def render_following(
         for name, found in measures.items()
     ]
     chart = svgs(draw_following, rows, WIDTH)
-    said = [*map(tidy, sentences)]
+    said = [*map(typeset, sentences)]
     return render("follow.html", title=title, sentences=said, table=table, chart=chart)
 
 

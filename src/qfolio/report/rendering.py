@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Callable, Collection, Sequence
 from importlib import resources
 from typing import Any
@@ -41,6 +42,12 @@ def render(template: str, **context: Any) -> str:
 def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
     """Return a number with a typographic minus sign and commas between thousands."""
     return figure(value, f"{'+' if sign else ''},.{digits}f")
+
+
+def typeset(text: str) -> str:
+    """Return a text with typographic minus signs, apostrophes and spaces before seconds."""
+    text = re.sub(r"(?<![\w.])-(?=\d)", "\N{MINUS SIGN}", text.replace("'", "’"))
+    return re.sub(r"(?<=\d) (?=s\b)", THIN_SPACE, text)
 
 
 def years(first: str, last: str) -> str:

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import re
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from qfolio.report.rendering import (
     percent,
     render,
     setting_groups,
+    typeset,
 )
 from qfolio.report.rule import rows
 
@@ -210,12 +210,7 @@ def _rule(rule: dict[str, Any] | None) -> list[tuple[str, str, str, str]]:
     def say(value: float | None) -> str:
         return "none" if value is None else number(value, 3)
 
-    return [(_signed(x.name), say(x.exact), say(x.mean), say(x.farthest)) for x in rows(rule)]
-
-
-def _signed(text: str) -> str:
-    """Return a text with typographic minus signs before its numbers."""
-    return re.sub(r"-(?=\d)", "\N{MINUS SIGN}", text)
+    return [(typeset(x.name), say(x.exact), say(x.mean), say(x.farthest)) for x in rows(rule)]
 
 
 def _mean_regret(summary: dict[str, Any]) -> float:
