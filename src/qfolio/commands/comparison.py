@@ -22,7 +22,7 @@ from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import again
-from qfolio.core.text import amount, figure, four_digits
+from qfolio.core.text import amount, figure
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -202,7 +202,7 @@ def _print_ranking(content: dict[str, Any]) -> None:
     from qfolio.experiments.comparison.ranking import HEADLINE
 
     ranking = content["ranking"]
-    write = conclusion.share if ranking["measure"] == "regret" else four_digits
+    write = conclusion.writer_of(ranking)
     near = f"steps to {HEADLINE:.0%}"
     spread = "95% interval" if ranking["seeds"] >= FEWEST_SEEDS else "range of seeds"
     heads = ("agent", ranking["measure"], spread, "worst", near, "s a seed", "parameters")

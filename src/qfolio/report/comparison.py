@@ -20,8 +20,8 @@ from qfolio.experiments.comparison.conclusion import (
     arrived,
     best_of,
     least,
-    share,
     span,
+    writer_of,
 )
 from qfolio.experiments.comparison.ranking import HEADLINE, THRESHOLDS, Result, curve
 from qfolio.report import palette, rendering
@@ -85,7 +85,7 @@ class ComparisonData:
 
     def write(self, value: float) -> str:
         """A regret or a return as text."""
-        return typeset(share(value) if self.graded else four_digits(value))
+        return typeset(writer_of(self.ranking)(value))
 
 
 def comparison_data(content: dict[str, Any]) -> ComparisonData:

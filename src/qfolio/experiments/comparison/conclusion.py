@@ -1,6 +1,7 @@
 """The conclusions of a comparison in sentences, and the format of its numbers."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from qfolio.core.text import figure, four_digits, listed, plural
@@ -76,7 +77,7 @@ def result_of(ranking: dict[str, Any], name: str, *, interval: bool = False) -> 
 
     ``interval`` adds its 95% interval, or the range of the seeds if they are too few for one.
     """
-    write = share if ranking["measure"] == "regret" else four_digits
+    write = writer_of(ranking)
     final = ranking["agents"][name]["final"]
     text, values = write(final["iqm"]), final["per_seed"]
     if interval and final["interval"] is not None:
@@ -84,6 +85,11 @@ def result_of(ranking: dict[str, Any], name: str, *, interval: bool = False) -> 
     elif interval and len(values) > 1:
         text += f" ({len(values)} seeds, {write(min(values))} to {write(max(values))})"
     return text
+
+
+def writer_of(ranking: dict[str, Any]) -> Callable[[float], str]:
+    """How a ranking's regrets or returns are written."""
+    return share if ranking["measure"] == "regret" else four_digits
 
 
 def share(fraction: float) -> str:
