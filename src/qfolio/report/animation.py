@@ -22,7 +22,6 @@ _ROD = 98.0
 _TRAIL = 14
 
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
-_RGB = tuple[int, int, int]
 
 
 def pendulum_gif(states: ArrayLike, torques: ArrayLike, rewards: ArrayLike) -> bytes:
@@ -90,7 +89,7 @@ def _draw_trail(pen: ImageDraw.ImageDraw, angles: Sequence[float]) -> None:
     parts = list(pairwise(angles))
     for age, (a, b) in zip(range(len(parts), 0, -1), parts, strict=True):
         share = 0.6 * (1 - age / (_TRAIL + 1)) ** 1.5
-        _arc(pen, _ROD, a, b, _mix(palette.HAIRLINE, palette.ACCENT, share), 1 + 7 * share)
+        _arc(pen, _ROD, a, b, palette.mix(palette.HAIRLINE, palette.ACCENT, share), 1 + 7 * share)
 
 
 def _draw_torque(pen: ImageDraw.ImageDraw, angle: float, torque: float) -> None:
@@ -161,7 +160,7 @@ def _at(radius: float, angle: float) -> tuple[float, float]:
 
 
 def _arc(
-    pen: ImageDraw.ImageDraw, radius: float, a: float, b: float, color: str | _RGB, width: float
+    pen: ImageDraw.ImageDraw, radius: float, a: float, b: float, color: str, width: float
 ) -> None:
     # Pillow measures clockwise from three o'clock.
     start, end = sorted(degrees(-angle - pi / 2) for angle in (a, b))
@@ -183,12 +182,6 @@ def _box(x: float, y: float, radius: float) -> tuple[float, float, float, float]
     return tuple(_SCALE * v for v in (x - radius, y - radius, x + radius, y + radius))  # type: ignore[return-value]
 
 
-def _mix(first: str, second: str, share: float) -> _RGB:
-    a, b = (np.array(ImageColor.getrgb(color)[:3]) for color in (first, second))
-    red, green, blue = np.round(a + share * (b - a)).astype(int).tolist()
-    return red, green, blue
-
-
 def _fade(last: Image.Image, first: Image.Image) -> list[Image.Image]:
     shares = np.arange(1, FADE_FRAMES + 1) / (FADE_FRAMES + 1)
     return [Image.blend(last, first, float(share)) for share in shares]
@@ -200,7 +193,7 @@ def _color_table() -> Image.Image:
     steps = {palette.INK: 20, palette.MUTED: 12, palette.HAIRLINE: 3}
     steps |= {palette.ACCENT: 20, palette.SECOND: 16}
     shades = [
-        _mix(palette.PAPER, color, step / count)
+        ImageColor.getrgb(palette.mix(palette.PAPER, color, step / count))
         for color, count in steps.items()
         for step in range(count + 1)
     ]

@@ -66,6 +66,13 @@ AGENTS = 6
 """Number of colors for agents; further agents reuse them with dashed lines."""
 
 
+def mix(first: str, second: str, share: float) -> str:
+    """The color at a share of the way from the first to the second."""
+    ends = [[int(color[i : i + 2], 16) for i in (1, 3, 5)] for color in (first, second)]
+    mixed = [round(a + share * (b - a)) for a, b in zip(*ends, strict=True)]
+    return "#" + "".join(f"{part:02x}" for part in mixed)
+
+
 class Marker(NamedTuple):
     """A marker in the notations of those that draw it."""
 

@@ -26,15 +26,8 @@ SHADES = 5
 """Shades of trials from the first to the last, or from the worst to the best."""
 
 
-def _mix(share: float) -> str:
-    """A color between the two ends of the shades."""
-    ends = [[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in (palette.HAIRLINE, palette.ACCENT)]
-    mixed = [round(a + share * (b - a)) for a, b in zip(*ends, strict=True)]
-    return "#" + "".join(f"{part:02x}" for part in mixed)
-
-
 _SHARES = np.linspace(0.22, 1, SHADES)
-_SHADES = [_mix(share) for share in _SHARES]
+_SHADES = [palette.mix(palette.HAIRLINE, palette.ACCENT, share) for share in _SHARES]
 
 
 def draw_sensitivity(data: Sweep, width: float) -> Figure:
