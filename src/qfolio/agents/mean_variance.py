@@ -20,12 +20,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from qfolio.agents.paths import Onlooker
 from qfolio.core import quadratic
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import Group, number, require, require_counts, static
+from qfolio.core.fields import number, require, static
 from qfolio.core.market import View
 from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.covariance import Covariance, Means
-from qfolio.learning.evidence import Evidence, EvidenceConfig, blocks_of, left_out
+from qfolio.learning.evidence import Evidence, blocks_of, left_out
 from qfolio.learning.trading import Trading, ratio
 
 
@@ -131,19 +131,10 @@ class MeanVariance(Onlooker):
     threshold: float = number(2.0)  # t-statistic up to which no returns are expected
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 
-    _evidence = Group(EvidenceConfig)
-
     def __check_init__(self) -> None:
-        require_counts(self, "units")
-        self._evidence.check()
-        require_counts(self, "rollout_length", 2)
-        require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
-                f"rollout_length, {self.rollout_length}")  # fmt: skip
         require(self, "every", lambda x: x >= 1 and self.rollout_length % x == 0, "a divisor of "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
         require(self, "risk_aversion", lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")
-        require(self, "ridge", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        self._schedule.check()
 
     def init(self, task: Task, key: PRNGKeyArray) -> MeanVarianceState:
         view = task.observe(task.reset(key))

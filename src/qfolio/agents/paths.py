@@ -16,10 +16,11 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import Group
+from qfolio.core.fields import Group, require, require_counts
 from qfolio.core.market import SEARCHED, View
 from qfolio.core.mdp import Agent, ExogenousTask, Metrics, Position, Task, Transition
 from qfolio.core.training import episode_steps
+from qfolio.learning.evidence import EvidenceConfig
 from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.trading import Trading
 
@@ -139,6 +140,17 @@ class OnPaths(Agent):
 class Onlooker(OnPaths):
     """Learns from the market's moves alone: its rollouts trade nothing, and nothing of them is
     logged."""
+
+    _evidence = Group(EvidenceConfig)
+
+    def __check_init__(self) -> None:
+        require_counts(self, "units")
+        self._evidence.check()
+        require_counts(self, "rollout_length", 2)
+        require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
+                f"rollout_length, {self.rollout_length}")  # fmt: skip
+        require(self, "ridge", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        self._schedule.check()
 
     def act(
         self, state: State, observation: View, key: PRNGKeyArray

@@ -22,11 +22,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from qfolio.agents.paths import AT_ONCE, Onlooker, Rewards
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import Group, number, require, require_counts, static
+from qfolio.core.fields import number, require, static
 from qfolio.core.market import View
 from qfolio.core.mdp import Box, Discrete, ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
-from qfolio.learning.evidence import Evidence, EvidenceConfig, blocks_of, left_out
+from qfolio.learning.evidence import Evidence, blocks_of, left_out
 from qfolio.learning.scores import NETWORKS, Attention, Hidden
 from qfolio.learning.trading import Trading, ratio
 
@@ -205,18 +205,10 @@ class Tilts(Onlooker):
     threshold: float = number(2.0)  # t-statistic up to which the policy stays at the anchor
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 
-    _evidence = Group(EvidenceConfig)
-
     def __check_init__(self) -> None:
         kinds = ", ".join(("linear", *NETWORKS))
         require(self, "network", lambda x: x in ("linear", *NETWORKS), f"one of {kinds}")
-        require_counts(self, "units")
-        self._evidence.check()
-        require_counts(self, "rollout_length", 2)
-        require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
-                f"rollout_length, {self.rollout_length}")  # fmt: skip
-        require(self, "tracking_aversion ridge", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        self._schedule.check()
+        require(self, "tracking_aversion", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
 
     def init(self, task: Task, key: PRNGKeyArray) -> TiltsState:
         view = task.observe(task.reset(key))
