@@ -34,7 +34,7 @@ from qfolio.core.mdp import (
     Transition,
 )
 from qfolio.learning import optimizer
-from qfolio.learning.networks import SHARED, Reading, Shared
+from qfolio.learning.networks import SHARED, Reading, Shared, start_at_zero
 from qfolio.learning.optimizer import Optimizer
 
 
@@ -223,14 +223,12 @@ class Pathwise(OnPaths):
         self._require_whole(task)
         view = task.observe(task.reset(key))
         network = Shared(self.network, view, self.hidden, pooled=0, each=2, key=key)
-        # With an output layer of zeros, the first policy is the initial band.
-        last = lambda n: (n.head.weights[-1], n.head.biases[-1])  # noqa: E731
-        network = eqx.tree_at(last, network, replace_fn=jnp.zeros_like)
-        policy = Band(network, task.actions)
+        # With outputs of zero, the first policy is the initial band.
+        policy = Band(start_at_zero(network), task.actions)
         slopes = None
         if self.bootstrap:
             network = Shared(self.network, view, self.hidden, pooled=0, each=1, key=apart(key))
-            slopes = Slopes(eqx.tree_at(last, network, replace_fn=jnp.zeros_like))
+            slopes = Slopes(start_at_zero(network))
         return PathwiseState(
             policy=policy,
             optimizer=optimizer.begin(policy),

@@ -1,7 +1,7 @@
 """Networks as plain matrix products over batches."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -197,6 +197,8 @@ LINEAR = (Values, OrderValue, Tilting)
 
 Network = Flat | LateAction | PerAsset | Values | OrderValue | Tilting
 
+N = TypeVar("N", bound=Network | Shared)
+
 
 class NetworkConfig(NamedTuple):
     """An agent's settings for its networks, by the names that they have there."""
@@ -263,11 +265,13 @@ def saturation(
 
 def last_layer(network: Any) -> Any:
     """Weights and biases of the output layer."""
-    mlp = network.network.head if isinstance(network, PerAsset) else network.mlp
+    if isinstance(network, PerAsset):
+        network = network.network
+    mlp = network.head if isinstance(network, Shared) else network.mlp
     return mlp.weights[-1], mlp.biases[-1]
 
 
-def start_at_zero(network: Network) -> Network:
+def start_at_zero(network: N) -> N:
     """The network with an output layer of zeros: its outputs are the same everywhere."""
     if isinstance(network, LINEAR):
         return network
