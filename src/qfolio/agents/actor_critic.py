@@ -310,6 +310,26 @@ class ActorCritic(Agent, Generic[L]):
             self.reward_scale * steps.reward, steps.terminal, following, batch.discount
         )
 
+    def regress(
+        self,
+        learned: L,
+        batch: Experience,
+        target: Float[Array, " batch"],
+        weight_decay: float = 0.0,
+    ) -> tuple[L, Metrics]:
+        """A step of the critics towards the target."""
+        critics, adam, metrics = optimizer.minimize(
+            critic_loss,
+            learned.critics,
+            learned.critic_adam,
+            self._schedule(learned.critic_adam.count),
+            batch,
+            target,
+            self.huber_delta,
+            weight_decay,
+        )
+        return eqx.tree_at(lambda x: (x.critics, x.critic_adam), learned, (critics, adam)), metrics
+
     def build(
         self, task: Task, observation: PyTree, outputs: networks.Outputs, key: PRNGKeyArray
     ) -> Network:

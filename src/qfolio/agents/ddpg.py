@@ -16,13 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.agents import actor_critic
-from qfolio.agents.actor_critic import (
-    ActorCritic,
-    ActorCriticState,
-    Batch,
-    Critics,
-    critic_loss,
-)
+from qfolio.agents.actor_critic import ActorCritic, ActorCriticState, Batch, Critics
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
@@ -140,19 +134,7 @@ class DDPG(ActorCritic[Learned]):
         """A step of the critics towards the Bellman target."""
         following = self.following(learned, batch.steps.next_observation, key)
         target = self.target(batch, following)
-        rate = self._schedule(learned.critic_adam.count)
-        critics, adam, metrics = optimizer.minimize(
-            critic_loss,
-            learned.critics,
-            learned.critic_adam,
-            rate,
-            batch.steps,
-            target,
-            self.huber_delta,
-            self.critic_weight_decay,
-        )
-        learned = eqx.tree_at(lambda x: (x.critics, x.critic_adam), learned, (critics, adam))
-        return learned, metrics
+        return self.regress(learned, batch.steps, target, self.critic_weight_decay)
 
     def following(
         self, learned: Learned, observation: PyTree, key: PRNGKeyArray

@@ -16,13 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.agents import actor_critic
-from qfolio.agents.actor_critic import (
-    ActorCritic,
-    ActorCriticState,
-    Batch,
-    Critics,
-    critic_loss,
-)
+from qfolio.agents.actor_critic import ActorCritic, ActorCriticState, Batch, Critics
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require
 from qfolio.core.mdp import Actions, Box, Discrete, Metrics, Simplex, Task
@@ -209,26 +203,18 @@ class SAC(ActorCritic[Learned]):
         value = following + temperature * entropy
         wanted = target_entropy(learned.actor.actions, self.spread)
         target = self.target(batch, value, self.bonus(wanted, entropy, temperature))
-        critics, critic_adam, metrics = optimizer.minimize(
-            critic_loss,
-            learned.critics,
-            learned.critic_adam,
-            rate,
-            batch.steps,
-            target,
-            self.huber_delta,
-        )
+        learned, metrics = self.regress(learned, batch.steps, target)
         actor, actor_adam, more = optimizer.minimize(
             actor_loss, learned.actor, learned.actor_adam, self.actor_learning_rate_ratio * rate,
-            critics, temperature, batch.steps.observation, key,
+            learned.critics, temperature, batch.steps.observation, key,
         )  # fmt: skip
         excess = more["entropy"] - wanted
         log_temperature, temperature_adam, last = optimizer.minimize(
             temperature_loss, learned.log_temperature, learned.temperature_adam, rate, excess
         )
-        target_critics = follow(learned.target_critics, critics, self.tau)
+        target_critics = follow(learned.target_critics, learned.critics, self.tau)
         learned = Learned(
-            actor, critics, target_critics, actor_adam, critic_adam,
+            actor, learned.critics, target_critics, actor_adam, learned.critic_adam,
             log_temperature, temperature_adam,
         )  # fmt: skip
         return learned, metrics | more | last
