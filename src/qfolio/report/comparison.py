@@ -15,7 +15,7 @@ import numpy as np
 from qfolio.core.arrays import AnyFloats
 from qfolio.core.files import write_text
 from qfolio.core.statistics import FEWEST_SEEDS, band, interquartile_mean
-from qfolio.core.text import four_digits, plural
+from qfolio.core.text import amount, four_digits
 from qfolio.experiments.comparison.conclusion import (
     arrived,
     best_of,
@@ -288,9 +288,7 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
     first = ranking["order"][0]
     optimum = next(iter(results.values())).optimum
     near = f"{percent(HEADLINE, 0)}"
-    facts = [
-        ("Agents", str(len(results)), f"{ranking['seeds']} {plural('seed', ranking['seeds'])} each")
-    ]
+    facts = [("Agents", str(len(results)), f"{amount(ranking['seeds'], 'seed')} each")]
     if data.graded and optimum is not None:
         facts.append(
             (

@@ -11,7 +11,7 @@ import numpy as np
 
 from qfolio.core.files import write_text
 from qfolio.core.statistics import mean_interval, regret
-from qfolio.core.text import plural
+from qfolio.core.text import amount
 from qfolio.experiments.tuning.journal import best_of
 from qfolio.experiments.tuning.sensitivity import Effect, short
 from qfolio.report.data import decimals
@@ -71,8 +71,7 @@ def _facts(data: Sweep) -> list[tuple[str, str, str]]:
     config = data.config
     trained = np.array(data.summary["return_per_seed"], float)
     graded = float(np.mean(trained))
-    count = len(data.summary["seeds"])
-    seeds = f"{count} {plural('seed', count)}"
+    seeds = amount(len(data.summary["seeds"]), "seed")
     note = f"retrained, {seeds}, graded starts"
     if data.summary["optimum"] is not None:
         note = f"retrained, {seeds}; optimum {number(data.summary['optimum'], digits)}"
@@ -81,7 +80,7 @@ def _facts(data: Sweep) -> list[tuple[str, str, str]]:
         (
             "Trials",
             number(len(data.trials), 0),
-            f"{config['seeds']} {plural('seed', config['seeds'])} each, {failed} diverged",
+            f"{amount(config['seeds'], 'seed')} each, {failed} diverged",
         ),
         ("Best found", number(best.value, digits), f"trial {best.number + 1}, on tuning starts"),
         ("Best, graded", "diverged" if math.isnan(graded) else number(graded, digits), note),

@@ -4,14 +4,14 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from qfolio.core.text import figure, four_digits, listed, plural
+from qfolio.core.text import amount, figure, four_digits, listed
 from qfolio.experiments.comparison.ranking import HEADLINE
 
 
 def conclusion(ranking: dict[str, Any]) -> list[str]:
     """The conclusions that a ranking supports, in sentences."""
     first, seeds = ranking["order"][0], ranking["seeds"]
-    each = f"with {seeds} {plural('seed', seeds)} each"
+    each = f"with {amount(seeds, 'seed')} each"
     level = best_of(ranking)
     tied: list[str] = []
     worse: list[str] = []
@@ -68,8 +68,8 @@ def arrived(ranking: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 def least(arrivals: dict[str, dict[str, Any]], key: str) -> tuple[float, list[str]]:
     """The least "steps" or "seconds" of some agents, and who needed no more."""
-    amount = min(entry[key] for entry in arrivals.values())
-    return amount, [name for name, entry in arrivals.items() if entry[key] == amount]
+    needed = min(entry[key] for entry in arrivals.values())
+    return needed, [name for name, entry in arrivals.items() if entry[key] == needed]
 
 
 def result_of(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
