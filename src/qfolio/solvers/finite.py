@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from scipy.sparse import csr_matrix, eye_array
 from scipy.sparse.linalg import spsolve
 
-from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import step_key
 from qfolio.core.mdp import Task
+from qfolio.solvers.shared import require
 
 Values = Float[np.ndarray, "state action"]
 
@@ -85,7 +85,7 @@ def policy_iteration(model: Model, discount: float, epsilon: float = 0.0) -> Val
 
     Raises QfolioError unless 0 ≤ discount < 1 and 0 ≤ epsilon ≤ 1.
     """
-    _require(discount, epsilon)
+    require(0 <= epsilon <= 1, f"epsilon is {epsilon}; it must be between 0 and 1")
     states, actions, _ = model.transitions.shape
     best = np.zeros(states, int)
     while True:
@@ -105,7 +105,10 @@ def policy_evaluation(model: Model, policy: Values, discount: float) -> Values:
 
     Raises QfolioError unless 0 ≤ discount < 1.
     """
-    _require(discount, 0.0)
+    require(
+        0 <= discount < 1,
+        f"The discount is {discount}; with an infinite horizon it must be at least 0 and below 1",
+    )
     states = len(policy)
     weights = policy[:, :, None] * model.transitions
     here = np.broadcast_to(np.arange(states)[:, None, None], weights.shape)
@@ -126,13 +129,3 @@ def finite_horizon(
         q = look_ahead(model, values, 1.0)
         values, policy[time] = q.max(-1), q.argmax(-1)
     return values, policy
-
-
-def _require(discount: float, epsilon: float) -> None:
-    if not 0 <= discount < 1:
-        raise QfolioError(
-            f"The discount is {discount}; with an infinite horizon it must be at least 0 and "
-            "below 1."
-        )
-    if not 0 <= epsilon <= 1:
-        raise QfolioError(f"epsilon is {epsilon}; it must be between 0 and 1.")
