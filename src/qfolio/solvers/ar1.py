@@ -43,7 +43,7 @@ def ar1(
     slope: float = 0.004,
     volatility: float = 0.01,
     cost: float = 0.002,
-    levels: ArrayLike = tuple(i / 10 for i in range(11)),
+    levels: ArrayLike = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     discount: float = 0.97,
     signal_points: int | None = None,
     holding_parts: int = 4,

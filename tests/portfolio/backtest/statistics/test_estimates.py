@@ -59,7 +59,8 @@ def test_a_difference_in_volatility_has_slow_transforms_only() -> None:
     """Ten years of 12 months: ν is 8, where that of growth is ⌊0.41 · 120^⅔⌋ = 9; of 2 years, 2."""
     rng = np.random.default_rng(0)
     for months, slow in ((120, 8), (24, 2)):
-        found = estimate(*rng.normal(0, 0.1, (2, 1, months)), 12)
+        ours, theirs = rng.normal(0, 0.1, (2, 1, months))
+        found = estimate(ours, theirs, 12)
         assert len(found["growth"].loads) == int(0.41 * months ** (2 / 3))
         assert len(found["volatility"].loads) == slow
 
