@@ -5,6 +5,7 @@ import json
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -171,6 +172,13 @@ def test_it_goes_on_from_where_it_was(policy):
     again = updated.update(table(ROWS + 1))
     assert again.updates == 2
     assert not same(again.learner, updated.learner)
+
+
+def test_an_update_learns_at_a_constant_tenth_of_the_rate():
+    """Although the cosine of the first training has come to its end."""
+    agent = module._slowed(AGENTS["pathwise"][0])
+    rates = [float(agent._schedule(jnp.array(update))) for update in (1, 6, 1000)]
+    np.testing.assert_allclose(rates, 0.001, rtol=1e-6)
 
 
 @pytest.mark.parametrize("episodes", [None, 6])

@@ -581,6 +581,11 @@ def test_returns_have_what_cash_earned(tmp_path):
     backtest = create(tmp_path / "run", agents=agents, cost_model="itemized(cash_rate=0.05)")
     backtest.run()
     entries, _ = backtest.entries()
-    write_tables(backtest, entries, backtest.assess(entries))
+    assessed = backtest.assess(entries)
+    write_tables(backtest, entries, assessed)
     _, columns = BacktestFolder(tmp_path / "run").read_returns()
     np.testing.assert_allclose(columns["risk_free"], np.expm1(0.05 / 365), rtol=1e-9)
+    returns = entries["equal-weight"].simulation.returns[0] - columns["risk_free"]
+    sharpe = assessed.strategies["equal-weight"].measures["sharpe"].mean
+    year = backtest.prices.periods_per_year
+    assert sharpe == pytest.approx(year**0.5 * returns.mean() / returns.std(ddof=1))

@@ -8,6 +8,7 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.baselines.equal_weight import BuyAndHold
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
@@ -15,6 +16,7 @@ from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.live import mark
+from qfolio.portfolio.desk.untrained import Rule
 from qfolio.portfolio.prices.table import Prices
 
 from tables import days, price_table, random_walk
@@ -84,6 +86,15 @@ def test_orders_hold_what_is_there_and_are_reproduced(desk, name):
         np.testing.assert_allclose(found.weights, made.weights, atol=1e-6)
     weights = followed.weights(prices, {"D": 0.5, "cash": 0.5})
     assert weights["D"] == weights["C"] == 0
+
+
+def test_what_is_told_to_be_held_of_a_delisted_asset_is_cash(desk):
+    policy, prices = desk.run.policy("pathwise"), table(NOW)
+    assert policy.weights(prices, {"A": 0.3, "D": 0.4}) == policy.weights(prices, {"A": 0.3})
+    task = desk.run.any_task
+    rule = Rule("hold", BuyAndHold(), ASSETS, task, train="100d", expanding=True, cap=1.0)
+    held = {"cash": 0.4, "A": 0.6, "B": 0, "C": 0, "D": 0, "E": 0}
+    assert rule.weights(prices, {"A": 0.6, "D": 0.4}) == pytest.approx(held)
 
 
 def test_a_table_without_its_members_is_refused(desk):

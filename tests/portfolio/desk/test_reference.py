@@ -39,6 +39,7 @@ INDEX = pd.DataFrame({"date": DAYS[:160], "level": np.exp(np.arange(160) * 1e-3)
     [
         ("equal-weight", {}),
         ("equal-weight", {"calendar": "drift:0.02"}),
+        ("equal-weight", {"calendar": "monthly"}),  # it trades first when the account does
         ("minimum-variance", {}),
         ("minimum-variance", {"mandate": {"assets": {"cap": 0.4}}}),
         ("A", {}),

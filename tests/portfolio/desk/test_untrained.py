@@ -198,6 +198,29 @@ def test_orders_that_the_lag_leaves_unfilled_are_named(tmp_path, fill, pending):
     assert [rows for rows, text in said.items() if unfilled in text] == pending
 
 
+def test_the_turnover_of_a_year_is_that_of_all_parts_of_its_orders(tmp_path):
+    """An allocation within the band leaves the parts that remain; the year allows 1.5."""
+    Backtest.create(
+        table(), AGENTS, out=tmp_path / "run", train="100d", test="60d", seeds=1, baselines=[],
+        calendar="drift:0.3", mandate={"trading": {"turnover_a_year": 1.5, "fill": 3}},
+    )  # fmt: skip
+    desk, prices = Desk.open(tmp_path / "run"), table()
+    rule, start = desk.followed("equal-weight"), prices.between(0, 131)
+    first = Allocation.of(rule, start, np.zeros(3), 1000.0)
+    desk.record("equal-weight", first, start, False)
+    after = prices.between(0, 132)
+    second = Allocation.of(rule, after, first.trades, first.cash_after, spent=first.turnover)
+    assert not second.trades.any()
+    desk.record("equal-weight", second, after, False)
+    for rows, parts in ((132, 1), (133, 2), (134, 3), (150, 3)):
+        spent = desk.spent(rule, prices.between(0, rows))
+        assert spent == pytest.approx(first.turnover * parts / 3)
+    # A table that begins later does not say which parts were filled.
+    assert desk.spent(rule, prices.between(140, None)) == pytest.approx(first.turnover)
+    for spent, left in ((0.0, 1.0), (1.0, 0.5), (1.5, 0.0)):
+        assert 1 - rule.weights(prices, spent=spent)["cash"] == pytest.approx(left, abs=1e-6)
+
+
 def test_a_margin_call_reduces_what_a_baseline_would_keep():
     """The margin calls above 1 / 0.58 = 1.72 times the wealth; the baseline orders nothing."""
     prices = table()

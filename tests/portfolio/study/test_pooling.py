@@ -3,9 +3,11 @@ import math
 import numpy as np
 import pytest
 
+from qfolio.portfolio.backtest.statistics.bootstrap import percentile_interval
 from qfolio.portfolio.backtest.statistics.estimates import estimate
 from qfolio.portfolio.study.evidence import TableReturns, evidence, z_of
 from qfolio.portfolio.study.pooling import (
+    RESAMPLES,
     correlations,
     hierarchical_bootstrap,
     p_value,
@@ -274,6 +276,29 @@ def test_intervals_of_tables_with_common_shocks_cover_the_mean(shared, monkeypat
         assert pooled.high is not None
         missed += not pooled.low <= 0 <= pooled.high
     assert missed <= 6  # 25 with shared shocks, if tables counted as independent
+
+
+def test_an_interval_is_as_much_wider_as_the_errors_that_tables_share():
+    """Errors are those of the means: four calm years count less than a wild one."""
+    rng = np.random.default_rng(9)
+    common, tables = rng.standard_normal(1008), {}
+    for name, size, count in (("calm", 0.001, 1008), ("wild", 0.003, 252)):
+        active = size * (common[:count] + 0.5 * rng.standard_normal(count))
+        flat = np.zeros(count)
+        each = {"a": np.expm1(active)}, {"ew": flat}, {"ew": flat}
+        tables[name] = TableReturns(days(0, count), 252.0, *each)
+    pooled = pool(tables, ["a"])["a"].to_reference
+    active = [np.log1p(each.agents["a"]) for each in tables.values()]
+    drawn = hierarchical_bootstrap(
+        [252 * each[None] for each in active], RESAMPLES, np.random.default_rng(0)
+    )
+    mean = 252 * np.mean([each.mean() for each in active])
+    one, other = (each.std(ddof=1) / math.sqrt(len(each)) for each in active)
+    shared = correlations([each.days for each in tables.values()], active)[0, 1]
+    wider = math.sqrt(1 + 2 * shared * one * other / (one**2 + other**2))
+    assert (pooled.low, pooled.high) == pytest.approx(
+        tuple(mean + wider * (percentile_interval(drawn[:, 0]) - mean))
+    )
 
 
 def test_tables_are_pooled():

@@ -9,8 +9,9 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.statistics import holm
 from qfolio.experiments.events import EVENTS, read
 from qfolio.experiments.executor import Here
+from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.folds import require_fold
-from qfolio.portfolio.study.folder import Variant
+from qfolio.portfolio.study.folder import StudyFolder, Variant
 from qfolio.portfolio.study.run import Study
 from qfolio.portfolio.study.summary import corrected, summarize
 
@@ -179,6 +180,17 @@ def test_a_backtest_that_has_gone_on_beyond_its_table_is_not_pooled(finished, tm
     assert Study.open(folder).config.result == finished.config.result
 
 
+def test_what_cash_earned_is_read_with_the_returns(finished, tmp_path):
+    files, main = StudyFolder(tmp_path / "study"), finished.config.variants[0]
+    shutil.copytree(finished.folder, files.path)
+    backtest = BacktestFolder(files.place("one", main))
+    dates, columns = backtest.read_returns()
+    rate = np.linspace(1e-4, 2e-4, len(dates))
+    backtest.write_returns(dates, {**columns, "risk_free": rate})
+    found = files.read_returns("one", main, finished.config).risk_free
+    np.testing.assert_array_equal(found, rate)
+
+
 def test_looks_are_counted_and_inherited(finished, tmp_path):
     result = finished.config.result
     assert (result.looks, result.earlier, result.trials) == (4, 0, 2)
@@ -188,7 +200,8 @@ def test_looks_are_counted_and_inherited(finished, tmp_path):
     assert later.config.tables["new"].trials == 3
     assert later.backtest("again").config.trials == 5
     assert len(later.config.earlier) == 4  # each once
-    last = create(tmp_path / "last", tables, trials=1, after=[finished.folder, later.folder])
+    after = [finished.folder, later.folder, later.folder]
+    last = create(tmp_path / "last", tables, trials=1, after=after)
     assert last.config.tables["again"].trials == 1 + 3 + 2  # those that the second was told of, too
     assert last.config.tables["new"].trials == 1 + 3
 
@@ -258,19 +271,21 @@ def test_a_verdict_counts_earlier_looks():
         for i, name in enumerate(config.tables)
     }
 
-    def said(trials):
+    def said(*trials):
         tables = {
-            name: msgspec.structs.replace(table, trials=trials)
-            for name, table in config.tables.items()
+            name: msgspec.structs.replace(table, trials=earlier)
+            for (name, table), earlier in zip(config.tables.items(), trials, strict=True)
         }
         changed = msgspec.structs.replace(config, tables=tables, agents=["tilts"])
         return summarize(changed, [tested]).verdicts["tilts"][0]
 
-    assert said(0).startswith("tilts beats equal-weight, however it is rebalanced,")
-    assert said(213).startswith("No evidence that tilts beats the best rebalancing of equal-weight")
-    assert said(213).endswith(
+    assert said(0, 0).startswith("tilts beats equal-weight, however it is rebalanced,")
+    luck = said(213, 213)
+    assert luck.startswith("No evidence that tilts beats the best rebalancing of equal-weight")
+    assert luck.endswith(
         "corrected p = 0.012, but luck is expected to reach a z of +2.79 after all looks."
     )
+    assert said(213, 0) == said(0, 213) == luck  # the table that was looked at most
 
 
 def test_short_tables_are_left_out_with_a_reason(tmp_path):

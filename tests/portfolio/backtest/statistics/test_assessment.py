@@ -133,6 +133,36 @@ def test_sharpe_ratios_and_their_moments_leave_out_what_cash_earns() -> None:
     assert mine.to_reference.sharpe.value == pytest.approx(0.25 / (93.75 / 19) ** 0.5 * 252**0.5)
 
 
+def test_interest_on_everything_changes_neither_a_ratio_nor_its_interval() -> None:
+    rng = np.random.default_rng(15)
+    entries = {"equal weight": strategy(rng, "baseline", 1), "dqn": strategy(rng)}
+    more = {n: e._replace(returns=np.asarray(e.returns) + 0.001) for n, e in entries.items()}
+    plain = assessed(entries, days(300), resamples=50).strategies["dqn"].measures
+    found = assessed(more, days(300), resamples=50, risk_free=np.full(300, 0.001))
+    for name in ("sharpe", "sortino"):
+        measure = found.strategies["dqn"].measures[name]
+        assert measure.mean == pytest.approx(plain[name].mean)
+        assert measure.over_time == pytest.approx(plain[name].over_time)
+
+
+def test_an_information_ratio_is_to_the_best_rebalancing() -> None:
+    rng = np.random.default_rng(14)
+    base, slow = strategy(rng, "baseline", 1), strategy(rng, "rebalancing", 1)
+    slow = slow._replace(returns=np.asarray(base.returns) + 0.002 * rng.random(300))
+    agent = strategy(rng, seeds=1)
+    entries = {"equal weight": base, "equal weight at 0.1": slow, "dqn": agent}
+    result = assessed(entries, days(300), resamples=10)
+    active = np.asarray(agent.returns) - slow.returns
+    test = result.strategies["dqn"].active_test
+    assert result.rebalanced == "equal weight at 0.1"
+    assert test is not None
+    assert test.ratio == pytest.approx(math.sqrt(252) * active.mean() / active.std(ddof=1))
+    assert test.kurtosis == pytest.approx(
+        ((active - active.mean()) ** 4).mean() / active.var() ** 2
+    )
+    assert result.strategies["equal weight at 0.1"].active_test is None
+
+
 def test_order_of_seeds_changes_nothing() -> None:
     rng = np.random.default_rng(10)
     base, agent = (

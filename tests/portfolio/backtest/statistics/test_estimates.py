@@ -109,6 +109,27 @@ def test_leverage_changes_no_sharpe_ratio() -> None:
     assert found["volatility"].tails().worse < 1e-4
 
 
+def test_money_in_cash_changes_no_sharpe_ratio_whatever_it_earns() -> None:
+    rng = np.random.default_rng(8)
+    rate = 0.001 + 0.0002 * rng.standard_normal(500)
+    market = 0.002 + 0.01 * rng.standard_normal((1, 500))
+    found = estimate((market + rate) / 2, market, 252, rate)["sharpe"]
+    assert found.tails() == (1, 1)
+
+
+def test_the_error_of_volatility_has_one_scale_for_both() -> None:
+    """A day's squared deviations differ by 3 times a square, in units of twice the mean of both."""
+    wave = np.sin(np.arange(20.0))[None]
+    wave -= wave.mean()
+    found = estimate(0.02 * wave, 0.01 * wave, 1.0)["volatility"]
+    variance = (wave**2).sum() / 19
+    each = 3 * wave[0] ** 2 / (2 * (4 * variance + variance) / 2)
+    sums = [(each * np.cos(math.pi * k * (np.arange(20) + 0.5) / 20)).sum() for k in (1, 2, 3)]
+    wanted = np.abs(np.array(sums) * math.sqrt(2) / 20)[: len(found.loads)]
+    np.testing.assert_allclose(np.abs(found.loads), wanted)
+    assert found.value == pytest.approx(math.log(2))
+
+
 def test_what_has_no_error() -> None:
     flat, gains = np.zeros((1, 50)), np.full((1, 50), 0.01)
     market = 0.01 * np.random.default_rng(4).standard_normal((1, 50))
@@ -146,6 +167,14 @@ def test_the_luckiest_of_several() -> None:
     assert (drawn > 2).mean() == pytest.approx(1 - 0.97725**5, abs=0.02)
     alike = luckiest(apart[:1] * 5, 20_000, rng)
     assert (alike > 2).mean() == pytest.approx(1 - 0.97725, abs=0.006)
+
+
+def test_the_luckiest_is_as_doubtful_as_the_error_that_is_known_least() -> None:
+    """Seeds of which there are two leave one degree of freedom: t = 12.7 is as rare as 1.96."""
+    loads = 0.001 * np.random.default_rng(7).standard_normal(500)
+    family = [Estimate(0.0, loads, 1e-4, 2), Estimate(0.0, loads, 1e-12, 2)]
+    drawn = luckiest(family, 20_000, np.random.default_rng(8))
+    assert 0.025 < (drawn > 12.706).mean() < 0.05  # of one alone, and of two
 
 
 @pytest.mark.slow
