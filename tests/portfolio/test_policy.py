@@ -176,7 +176,7 @@ def test_it_goes_on_from_where_it_was(policy):
 
 def test_an_update_learns_at_a_constant_tenth_of_the_rate():
     """Although the cosine of the first training has come to its end."""
-    agent = module._slowed(AGENTS["pathwise"][0])
+    agent: Any = module._slowed(AGENTS["pathwise"][0])
     rates = [float(agent._schedule(jnp.array(update))) for update in (1, 6, 1000)]
     np.testing.assert_allclose(rates, 0.001, rtol=1e-6)
 

@@ -283,9 +283,9 @@ def test_an_interval_is_as_much_wider_as_the_errors_that_tables_share():
     rng = np.random.default_rng(9)
     common, tables = rng.standard_normal(1008), {}
     for name, size, count in (("calm", 0.001, 1008), ("wild", 0.003, 252)):
-        active = size * (common[:count] + 0.5 * rng.standard_normal(count))
+        moves = size * (common[:count] + 0.5 * rng.standard_normal(count))
         flat = np.zeros(count)
-        each = {"a": np.expm1(active)}, {"ew": flat}, {"ew": flat}
+        each = {"a": np.expm1(moves)}, {"ew": flat}, {"ew": flat}
         tables[name] = TableReturns(days(0, count), 252.0, *each)
     pooled = pool(tables, ["a"])["a"].to_reference
     active = [np.log1p(each.agents["a"]) for each in tables.values()]
