@@ -13,6 +13,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
 from qfolio.core.mdp import Simplex
 from qfolio.core.population import Population
+from qfolio.core.training import begin, play
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
@@ -77,6 +78,30 @@ def test_expected_returns_are_learned_only_where_there_is_momentum():
     assert found.policy.learned.members.means.coefficients.sum(1).mean() > 0.5
     assert found.policy.share > 0.5
     assert [float(state.policy.share) for state in nothing].count(0.0) >= 2
+
+
+def test_a_step_is_evidence_from_the_one_member_that_does_not_learn_from_it():
+    """If all members expect the same returns, it does not matter how many there are."""
+    task = Portfolio.of(prices(np.random.default_rng(1).normal(0, 0.01, (300, 3))), **TASK)
+    found = []
+    for count in (2, 4):
+        agent = MeanVariance(**SMALL, members=count)
+        start = begin(task, agent, jnp.uint32(0))
+        where = lambda s: s.agent.policy.learned.members.means.coefficients  # noqa: E731
+        start = eqx.tree_at(where, start, jnp.full((count, 4), 0.1))
+
+        @jax.jit
+        def learned(start, agent=agent):
+            state, rollout = play(task, agent, start)
+            return agent.learn(task, state.agent, rollout, jax.random.key(0))[0]
+
+        state = learned(start)
+        found.append(state.evidence)
+        means = state.policy.learned.members.means.coefficients
+        assert len(np.unique(means, axis=0)) == count  # of other blocks each
+    assert abs(found[0].total).max() > 1e-6
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-4, atol=1e-9)
 
 
 def test_without_evidence_it_is_the_least_variance():

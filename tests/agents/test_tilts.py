@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
 from qfolio.core.mdp import Position, Simplex, Transition
 from qfolio.core.population import Population, programs_of
+from qfolio.core.training import begin, play
 from qfolio.learning.evidence import Evidence, blocks_of, left_out
 from qfolio.learning.scores import Hidden
 from qfolio.learning.trading import Trading
@@ -66,6 +68,11 @@ def test_target_is_the_nearest_without_negative_weights():
     exact = simplex.project(anchor + wanted)
     np.testing.assert_allclose(found[:, 1:], exact, atol=1e-5)
     np.testing.assert_allclose(found[:, 0], 0, atol=1e-6)
+
+
+def test_an_input_of_five_deviations_counts_as_three():
+    found, wanted = (tilt([0.1]).target(view([0, 0, 0], [[x], [0.0], [-x]])) for x in (5.0, 3.0))
+    np.testing.assert_array_equal(found, wanted)
 
 
 def test_interaction_multiplies_inputs_with_their_mean_over_the_assets():
@@ -130,6 +137,12 @@ def test_evidence_is_the_t_statistic_of_ratios_by_block():
     np.testing.assert_allclose(evidence.t, wanted, rtol=1e-4)
 
 
+def test_a_block_of_one_step_is_no_evidence():
+    two = Evidence(jnp.array([5.0, 5.0]), jnp.array([1.0, 2.0]), jnp.array([4.0, 4.0]))
+    three = Evidence(*(jnp.append(x, last) for x, last in zip(two, (1.0, 3.0, 9.0), strict=True)))
+    np.testing.assert_allclose(three.t, two.t, rtol=1e-6)
+
+
 def test_no_evidence_of_nothing():
     assert Evidence.none(8).t == 0
 
@@ -139,6 +152,44 @@ def trained(*tables, rounds=40, signals=TASK["signals"], **settings):
     population = Population(tasks, Tilts(**SMALL, **settings), range(len(tables)))
     train_to(population, rounds * SMALL["rollout_length"])
     return jax.tree.map(jnp.asarray, population.fetch().agent)
+
+
+def test_a_step_is_evidence_from_the_one_member_that_does_not_learn_from_it():
+    """As all members trade alike at first, it does not matter how many there are."""
+    few, many = (
+        trained(random_walk(300, 3, seed=3), rounds=1, network="linear", members=count)
+        for count in (2, 4)
+    )
+    assert abs(few.evidence.total).max() > 1e-6
+    for one, other in zip(few.evidence, many.evidence, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-4, atol=1e-9)
+    gradients = np.asarray(many.optimizer.mu.linear[0])
+    assert len(np.unique(gradients, axis=0)) == 4  # of other blocks each
+
+
+def test_evidence_is_over_the_anchor_at_the_speed_that_is_followed():
+    """At the start, members without a tilt trade as the anchor does at its learned speed."""
+    task = Portfolio.of(price_table(random_walk(300, 3, seed=3)), **TASK)
+    agent = Tilts(**SMALL, network="linear")
+    start = begin(task, agent, jnp.uint32(0))
+
+    @jax.jit
+    def evidence(speed):
+        now = eqx.tree_at(lambda s: s.agent.policy.speed, start, speed)
+        state, rollout = play(task, agent, now)
+        return agent.learn(task, state.agent, rollout, jax.random.key(0))[0].evidence
+
+    in_a_band, followed = (abs(evidence(jnp.array(x)).total).max() for x in (0.0, 1.0))
+    assert followed < 1e-6 < in_a_band
+
+
+def test_the_more_averse_to_tracking_error_the_smaller_are_tilts():
+    task = Portfolio.of(price_table(random_walk(300, 3, seed=3)), **TASK)
+    agents = [Tilts(**SMALL, network="linear", tracking_aversion=a) for a in (0.0, 1e4)]
+    population = Population(task, agents, [0, 0])
+    train_to(population, 20 * SMALL["rollout_length"])
+    bold, averse = abs(population.fetch().agent.policy.members.linear).mean((1, 2))
+    assert averse < bold / 2
 
 
 @pytest.mark.parametrize("network", ["linear", "hidden"])

@@ -83,6 +83,14 @@ def test_another_shape_of_the_same_numbers_is_noticed(tmp_path):
         read_arrays(path)
 
 
+def test_another_name_of_the_same_numbers_is_noticed(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    write_arrays(path, {"mean": np.arange(6.0)})
+    path.write_bytes(path.read_bytes().replace(b'"mean"', b'"rate"'))
+    with pytest.raises(QfolioError, match="digest"):
+        read_arrays(path)
+
+
 def test_arrays_without_a_digest_are_refused(tmp_path):
     from safetensors.numpy import save_file
 

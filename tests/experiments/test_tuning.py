@@ -792,17 +792,8 @@ def test_the_learning_rate_ends_with_the_training(tmp_path, monkeypatch, capsys)
         said = capsys.readouterr().err
         assert float(said.split()[-1]) == pytest.approx(steps, rel=0.01)
 
-    few = (
-        "tune",
-        "market/kelly",
-        "--agent",
-        "pathwise",
-        "--episodes",
-        50,
-        "--out",
-        tmp_path / "few",
-    )
-    assert qfolio(monkeypatch, *few) == 2
+    few = ["market/kelly", "--agent", "pathwise", "--episodes", 50]
+    assert qfolio(monkeypatch, "tune", *few, "--out", tmp_path / "few") == 2
     assert 0 < float(capsys.readouterr().err.split()[-1]) < 0.05  # which is not rounded to 0
 
 

@@ -79,6 +79,11 @@ def test_between_decisions_the_target_is_what_is_held() -> None:
     assert (task.target(last, task.hold(held), wanted) == wanted).all()
 
 
+def test_tomorrows_weights_may_be_asked_for_on_any_day() -> None:
+    task = Portfolio.of(price_table(random_walk(50)), calendar="monthly", window=5, horizon=10)
+    assert np.flatnonzero(task.decides).tolist() == [0, 31, 49]
+
+
 def test_orders_wait_for_drift_beyond_the_band() -> None:
     task = Portfolio.of(table(), window=5, horizon=10, calendar="drift:0.05")
     rng, row = np.random.default_rng(1), jnp.array(200)

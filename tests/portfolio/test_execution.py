@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qfolio.portfolio.backtest.baselines import Baseline
-from qfolio.portfolio.backtest.baselines.equal_weight import BuyAndHold
+from qfolio.portfolio.backtest.baselines.equal_weight import BuyAndHold, EqualWeight
 from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.notes import called
 from qfolio.portfolio.backtest.orders import AT_EVERY_ROW, orders
@@ -237,6 +237,26 @@ def test_a_margin_call_does_not_wait_for_a_baseline():
         # With a band, every row decides.
         assert called(replay, {"hold": entry}, ()) == (said if calendar == "yearly" else [])
         assert called(replay, {"hold": entry}, ("hold",)) == []
+
+
+class Once(EqualWeight):
+    """Decides once a fold, and counts how often it is asked."""
+
+    calendar = "fold"
+    asked = 0
+
+    def decide(self, history, held):
+        self.asked += 1
+        return super().decide(history, held)
+
+
+def test_at_a_margin_call_the_target_of_a_fold_stands():
+    fold = Fold("only", slice(0, FIRST), slice(FIRST, LAST), slice(0, FIRST))
+    prices, task = leveraged("yearly")
+    once = Once()
+    entry, _ = Replay(prices, [fold], task.deciding_at(FIRST), 1.0).baseline("baseline", "x", once)
+    assert (~np.isnan(entry.decisions[0, :, 0])).sum() > 2  # calls
+    assert once.asked == 1
 
 
 def test_terms_do_nothing_where_there_are_none():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest import simulation
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import Context, Proportional
@@ -309,6 +310,33 @@ def test_cash_earns_its_rate_over_weekends() -> None:
     earned = simulate(prices.values, still, first=0, cost=model, lag=0, conditions=known)
     days = np.diff(prices.dates) / np.timedelta64(1, "D")
     np.testing.assert_allclose(earned.growth, 0.05 * days / 365, rtol=1e-12)
+
+
+def test_a_loan_costs_its_spread_though_nothing_else_is_charged() -> None:
+    prices, model = table(1), Itemized(cost=0, borrow_spread=0.05)
+    orders = np.tile([-0.5, 1.5, 0.0, 0.0], (ROWS - 1, 1))
+    known = Conditions.of(prices, model)
+    earned = simulate(
+        prices.values, orders, first=0, cost=model, lag=0, conditions=known, long_only=False
+    )
+    days = np.diff(prices.dates) / np.timedelta64(1, "D")
+    interest = np.expm1(0.05 * days / 365)
+    np.testing.assert_allclose(
+        earned.returns, 1.5 * (prices.relatives[:, 0] - 1) - 0.5 * interest, atol=1e-12
+    )
+
+
+def test_fees_follow_the_wealth_through_a_history_of_many_blocks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    prices, model = table(2, rows=60), Itemized(fixed=50, capital=1e4)
+    orders = np.random.default_rng(2).dirichlet(np.ones(4), 58)
+    known = Conditions.of(prices, model)
+    once, daily = np.empty((2, 58))
+    for found, block in ((once, 60_000), (daily, 1)):
+        monkeypatch.setattr(simulation, "BLOCK", block)
+        found[:] = simulate(prices.values, orders, first=0, cost=model, conditions=known).returns
+    np.testing.assert_allclose(daily, once, rtol=0, atol=1e-12)
 
 
 def test_an_account_that_is_wiped_out_stays_at_nothing() -> None:

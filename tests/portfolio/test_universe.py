@@ -671,7 +671,8 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
     )
     rows.to_csv(tmp_path / "rows.csv")
     (tmp_path / "spans.csv").write_text(
-        "asset,from,to\nA,2024-01-03,\nB,2024-01-15,\nC,2024-01-03,2024-01-12\nZ,,\n"
+        "asset,from,to\nA,2024-01-03,2024-01-08\nB,2024-01-15,\nC,2024-01-03,2024-01-12\nZ,,\n"
+        "A,2024-01-09,\n"  # it comes back the next day
     )
     day = frame.index
     wanted = np.stack(
@@ -689,6 +690,7 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
     rows.astype(bool).to_csv(tmp_path / "truth.csv")
     for source in (
         rows,
+        rows[::-1],
         numbered.set_axis([7, 9]),  # numbers that are no dates
         numbered[["A", "B", "C", "Z", "date"]],
         rows.astype(bool),

@@ -180,3 +180,13 @@ def test_other_rows_are_refused_by_name(first, other, message):
     with pytest.raises(QfolioError, match=message):
         first.extended(other())
     assert (first.folder / "prices.safetensors").read_bytes() == kept
+
+
+def test_another_rate_of_the_market_is_refused_by_name():
+    rate = np.full((ROWS, 1), 0.02)
+    before, after = (
+        changed(market=each, market_names=("rate",)) for each in (rate, moved(rate, 9, 0))
+    )
+    require_grown(before.between(0, FIRST), before)
+    with pytest.raises(QfolioError, match="'rate' on 2020-01-10 where"):
+        require_grown(before.between(0, FIRST), after)

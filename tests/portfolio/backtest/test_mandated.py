@@ -12,6 +12,7 @@ from qfolio.experiments.presets import Preset
 from qfolio.portfolio.anchors import path
 from qfolio.portfolio.backtest.attribution.decomposition import decompose
 from qfolio.portfolio.backtest.attribution.explain import open_to
+from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
 from qfolio.portfolio.backtest.notes import mandated
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.backtest.run import Backtest
@@ -190,6 +191,22 @@ def test_baselines_leave_no_cash_in_place_of_assets_that_may_not_be_held(tmp_pat
     np.testing.assert_allclose(entries["equal-weight"].decisions[0, :, 2:5], 1 / 3)
     target = Desk.open(tmp_path / "run").followed("equal-weight").weights(backtest.prices)
     assert list(target.values()) == pytest.approx([0, 0, 1 / 3, 1 / 3, 1 / 3, 0])
+
+
+class Capped(EqualWeight):
+    """Remembers the caps that it was told of."""
+
+    def decide(self, history, held):
+        self.caps = {*getattr(self, "caps", ()), history.cap}
+        return super().decide(history, held)
+
+
+def test_a_baseline_knows_the_largest_cap_of_its_mandate():
+    capped = Capped()
+    agents = {"pathwise": AGENTS["pathwise"]}
+    create({"assets": {"cap": {"A": 0.3, "B": 0.4, "C": 0.4, "D": 0.4, "E": 0.4}}}, agents=agents,
+           cap=0.9).replay.baseline("baseline", "capped", capped)  # fmt: skip
+    assert capped.caps == {0.4}
 
 
 def test_equal_weights_are_those_of_what_a_mandate_allows():

@@ -11,8 +11,10 @@ from qfolio.portfolio.backtest.folds import spell_all
 from qfolio.portfolio.backtest.own import Own
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.consistency import Promise, band, evidence
 from qfolio.portfolio.desk.desk import Desk
-from qfolio.portfolio.desk.follow import follow
+from qfolio.portfolio.desk.follow import SEED, follow
+from qfolio.portfolio.desk.live import mark
 from qfolio.portfolio.desk.standing import Standing
 from qfolio.portfolio.desk.untrained import Ordered, Rule
 from qfolio.portfolio.prices.table import Prices, load
@@ -172,6 +174,14 @@ def test_the_ledger_of_a_strategy_is_followed_and_reproduced(desk):
     assert len(found.live.returns) == 160 - 131
     np.testing.assert_allclose(found.live.returns[1:], returns["60/40"][132 - 160 :], atol=1e-12)
     assert "60/40 learns nothing, so there is nothing to train." in found.sentences()
+    # Evidence is half against its own returns, and half against those over the benchmark.
+    rng, lead = np.random.default_rng(SEED), returns["60/40"] - returns["C"]
+    band(returns["60/40"], 29, rng)
+    own, over = (Promise.of(each, rng, promises=2) for each in (returns["60/40"], lead))
+    wanted = evidence(own, found.live.returns) + evidence(
+        over, found.live.returns - found.reference
+    )
+    np.testing.assert_allclose(found.evidence, wanted / 2)
     assert not any("fills orders" in x for x in desk.terms(known, start, allocation, 0.0))
     rule = desk.followed("momentum")
     assert any("over 2 rows" in x for x in desk.terms(rule, start, allocation, 0.0))
@@ -219,6 +229,11 @@ def test_the_turnover_of_a_year_is_that_of_all_parts_of_its_orders(tmp_path):
     assert desk.spent(rule, prices.between(140, None)) == pytest.approx(first.turnover)
     for spent, left in ((0.0, 1.0), (1.0, 0.5), (1.5, 0.0)):
         assert 1 - rule.weights(prices, spent=spent)["cash"] == pytest.approx(left, abs=1e-6)
+    dates = spell_all(desk.run.dates, desk.run.dates)
+    tested = np.random.default_rng(0).normal(0, 0.01, len(dates))
+    BacktestFolder(desk.folder).write_returns(dates, {"equal-weight": tested})
+    live = mark(desk.ledger.current(), prices, rule.costs, 1, [3, 3], band=0.3)
+    np.testing.assert_array_equal(follow(desk).live.returns, live.returns)
 
 
 def test_a_margin_call_reduces_what_a_baseline_would_keep():
