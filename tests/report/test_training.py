@@ -48,6 +48,7 @@ from qfolio.report.figures.curves import (
     draw_learning_curve,
     draw_overestimation,
 )
+from qfolio.report.figures.pendulum import draw_value
 from qfolio.report.figures.policies import draw_policy
 from qfolio.report.training import (
     duration,
@@ -294,6 +295,11 @@ def test_one_seed_one_evaluation_and_no_extras(tmp_path: Path) -> None:
     assert "without double DQN" not in page
 
 
+def test_value_needs_maps() -> None:
+    with pytest.raises(ValueError, match="maps"):
+        draw_value(replace(make_data(steps=1), maps=None), 7.2)
+
+
 def test_a_full_disk_leaves_the_earlier_report(tmp_path, monkeypatch):
     def full(file):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -336,6 +342,11 @@ def test_arrow_shows_the_torque() -> None:
     blue, orange = (11, 99, 165), (196, 87, 10)
     assert colored(2.0, blue) > colored(1.0, blue) > colored(0.0, blue) == 0
     assert colored(-2.0, orange) > colored(-1.0, orange) > colored(2.0, orange) == 0
+
+
+def test_episode_of_wrong_shape() -> None:
+    with pytest.raises(ValueError, match="do not fit an episode"):
+        pendulum_frames(np.zeros((3, 2)), np.zeros(3), np.zeros(3))
 
 
 def _center_of(frame: Image.Image, color: tuple[int, int, int]) -> tuple[float, float]:
@@ -570,6 +581,11 @@ def test_weights_are_drawn_beside_the_exact_ones() -> None:
     assert mean == pytest.approx([0.55, 0.3])
     assert exact == [0.55, 0.45]
     assert "One row per asset" in render_page(data)
+
+
+def test_policy_needs_a_market() -> None:
+    with pytest.raises(ValueError, match="policies of a market"):
+        draw_policy(replace(make_market(), market=None), 7.2)
 
 
 def test_a_beginner_far_off_does_not_hide_the_curve() -> None:

@@ -35,6 +35,9 @@ def pendulum_gif(states: ArrayLike, torques: ArrayLike, rewards: ArrayLike) -> b
             shape (T + 1, 2).
         torques: Torques in N m, counter-clockwise positive, shape (T,).
         rewards: Rewards, shape (T,).
+
+    Raises:
+        ValueError: The shapes do not match.
     """
     frames = pendulum_frames(states, torques, rewards)
     step = round(1000 * STEP_SECONDS)
@@ -57,13 +60,11 @@ def pendulum_gif(states: ArrayLike, torques: ArrayLike, rewards: ArrayLike) -> b
 
 def pendulum_frames(states: ArrayLike, torques: ArrayLike, rewards: ArrayLike) -> list[Image.Image]:
     """Return the T + 1 pictures of an episode, SIZE x SIZE pixels each; see pendulum_gif."""
-    angles = np.asarray(states, dtype=float)[:, 0].tolist()
-    applied = [*np.asarray(torques, dtype=float).tolist(), 0.0]
-    totals = np.concatenate([[0.0], np.cumsum(rewards, dtype=float)]).tolist()
+    angles, torques, totals = _checked(states, torques, rewards)
     font = ImageFont.load_default(size=13 * _SCALE)
     background = _background()
     frames = []
-    for number, (angle, torque, total) in enumerate(zip(angles, applied, totals, strict=True)):
+    for number, (angle, torque, total) in enumerate(zip(angles, torques, totals, strict=True)):
         image = background.copy()
         pen = ImageDraw.Draw(image)
         _draw_trail(pen, angles[max(0, number - _TRAIL) : number + 1])
@@ -72,6 +73,19 @@ def pendulum_frames(states: ArrayLike, torques: ArrayLike, rewards: ArrayLike) -
         _draw_caption(pen, font, number * STEP_SECONDS, total, number / max(1, len(angles) - 1))
         frames.append(image.reduce(_SCALE))
     return frames
+
+
+def _checked(
+    states: ArrayLike, torques: ArrayLike, rewards: ArrayLike
+) -> tuple[list[float], list[float], list[float]]:
+    """Return angles, torques and cumulative returns, each with one number per frame."""
+    state, torque, reward = (np.asarray(a, dtype=float) for a in (states, torques, rewards))
+    steps = len(torque)
+    if state.shape != (steps + 1, 2) or torque.shape != (steps,) or reward.shape != (steps,):
+        shapes = f"{state.shape}, {torque.shape} and {reward.shape}"
+        raise ValueError(f"states, torques and rewards of shapes {shapes} do not fit an episode")
+    totals = np.concatenate([[0.0], np.cumsum(reward)])
+    return state[:, 0].tolist(), [*torque.tolist(), 0.0], totals.tolist()
 
 
 def _background() -> Image.Image:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.statistics.differences import Contrast
 from qfolio.portfolio.backtest.statistics.verdict import verdicts
@@ -306,6 +307,15 @@ def test_total_loss_one_seed_and_the_shortest_test() -> None:
     assert dqn["wealth"] == [1, 1.1, None]
     assert dqn["band"] is None
     assert not re.search(r"\bnan\b", "".join(page.words).lower())
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    data = usual(20)
+    fewer = {name: s for name, s in data.strategies.items() if name != "third"}
+    with pytest.raises(QfolioError, match="different strategies"):
+        render_backtest(replace(data, strategies=fewer))
+    with pytest.raises(QfolioError, match="do not fit 20 dates and 3 assets"):
+        render_backtest(replace(data, assets=("A", "B", "C")))
 
 
 def test_picture(folder: Path) -> None:

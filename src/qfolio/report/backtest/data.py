@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.core.arrays import Floats
+from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.folder import followed
@@ -93,6 +94,27 @@ class BacktestData:
     def trades(self) -> NDArray[np.datetime64]:
         """The dates of the trades before each return, shape (D,)."""
         return np.append(self.begin, self.dates[:-1])
+
+
+def require_fit(data: BacktestData) -> None:
+    """Raise QfolioError if strategies, assessment, dates and assets do not match."""
+    explained = set() if data.why is None else set(data.why.agents)
+    if set(data.strategies) != set(data.assessment.strategies) or explained - set(data.strategies):
+        raise QfolioError(
+            "The series and the statistics are of different strategies; report one backtest."
+        )
+    days = (len(data.dates),)
+    for name, series in data.strategies.items():
+        shape = series.returns.shape
+        fits = shape[1:] == days and series.turnover.shape == series.cost.shape == shape
+        if not fits or series.weights.shape != (*days, len(data.assets) + 1):
+            raise QfolioError(
+                f"The series of {name} do not fit {days[0]} dates and {len(data.assets)} assets."
+            )
+    if data.moves.shape != (*days, len(data.assets)):
+        raise QfolioError(
+            f"The assets' returns do not fit {days[0]} dates and {len(data.assets)} assets."
+        )
 
 
 def followed_names(data: BacktestData) -> list[str]:

@@ -30,6 +30,7 @@ from qfolio.report.backtest.data import (
     BacktestData,
     best_word,
     main_names,
+    require_fit,
     shown_order,
 )
 from qfolio.report.backtest.facts import account, few_seeds, key_facts, unit_of
@@ -79,6 +80,7 @@ def write_backtest_report(folder: Path, data: BacktestData) -> None:
 
     Raises:
         OSError: A file cannot be written.
+        QfolioError: Strategies, assessment, dates and assets do not fit together.
     """
     page = render_backtest(data)
     save_png(folder / "wealth.png", draw_wealth, data, LEAD)
@@ -89,6 +91,7 @@ def render_backtest(data: BacktestData) -> str:
     """Return the text of the page; see ``write_backtest_report``."""
     from plotly.offline import get_plotlyjs
 
+    require_fit(data)
     names, lead = shown_order(data), main_names(data)
     looks = looks_of(names, data)
     payload = chart_data(names, looks, data)

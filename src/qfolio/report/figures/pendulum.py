@@ -20,9 +20,13 @@ from qfolio.report.figures.style import NARROW, Panels, colors, new_figure
 
 
 def draw_value(data: ReportData, width: float) -> Figure:
-    """Draw the learned and the exact policy, and the values if there are any, over the states."""
+    """Draw the learned and the exact policy, and the values if there are any, over the states.
+
+    Raises ValueError without maps.
+    """
     maps = data.maps
-    assert maps is not None
+    if maps is None:
+        raise ValueError("the value figure needs maps of the state space")
     rows = 1 if maps.value is None else 2
     figure = new_figure(width, (0.98 if width > NARROW else 1.2) * width * rows / 2)
     axes = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)

@@ -26,10 +26,13 @@ from qfolio.report.figures.style import (
 
 
 def draw_policy(data: ReportData, width: float) -> Figure:
-    """Draw the targets of the learned policies and the best one in a market."""
-    assert data.market is not None
-    assert data.market.policy is not None
-    drawn = data.market.policy
+    """Draw the targets of the learned policies and the best one in a market.
+
+    Raises ValueError without them.
+    """
+    drawn = data.market.policy if data.market else None
+    if drawn is None:
+        raise ValueError("the policy figure needs the policies of a market")
     if isinstance(drawn, Weights):
         return _draw_weights(drawn, width)
     return _draw_responses(drawn, width)
