@@ -82,7 +82,7 @@ WRONG_TYPES = {
     "preset('fast', Pendulum())": "task is Pendulum(); it must be text.",
     "read_holdings(None, ['A'], '100')": "capital is '100'; it must be a sum of money, such as",
     "read_holdings(None, ['A'], True)": "capital is True; it must be a sum of money, such as",
-    "require_fresh(prices, 7)": "--as-of is '7'; it must be a date such as 2025-12-31.",
+    "require_fresh(prices, 7)": "--as-of is '7'; it must be a date such as 2025-12-31 or,",
 }
 
 

@@ -68,7 +68,8 @@ def allocate(
             policy has learned from later prices.
         whole_shares: Trade whole shares only.
         as_of: Day of the allocation; prices may be up to a week older, or more where their rows are
-            farther apart than a day (default: today).
+            farther apart than a day. For prices of several times a day it may be a time in UTC,
+            such as 2025-12-31T15:00 (default: now).
         update: Update the policy on the new rows first, if there are any, and store the new version
             beside the earlier ones.
         orders: Write the trades to this CSV file, outside of the folder.
@@ -76,8 +77,9 @@ def allocate(
             schwab for the fields of an order in their APIs.
         currency: Currency in that file, where the layout names one.
         dry_run: Write nothing: no record in the ledger, no updated policy and no file of orders.
-        reproduce: Recompute the allocation that the ledger records for this date and compare the
-            two, with the inputs stored there or, if given, --prices and --holdings.
+        reproduce: Recompute the allocation that the ledger records for this date, or time such as
+            2025-12-31T15:00, and compare the two, with the inputs stored there or, if given,
+            --prices and --holdings.
         trust: Modules of your own code that the folder may name (default: none).
         returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
             shares and orders need prices (default: they are prices).

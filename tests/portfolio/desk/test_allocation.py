@@ -38,6 +38,20 @@ def test_from_cash_by_hand():
     assert allocation.cash_after == pytest.approx(0, abs=1e-9)
 
 
+class Patient(Proportional):
+    """Costs that halve with each row that an order may wait."""
+
+    def trade(self, before, after, context):
+        return Proportional(0.01 * 0.5**context.rows).trade(before, after, context)
+
+
+@pytest.mark.parametrize("lag", [0, 1, 2])
+def test_a_cost_model_sees_how_long_orders_wait(lag):
+    policy = Fixed([0.5, 0.5, 0], Patient())
+    allocation = Allocation.of(policy, PRICES, np.zeros(2), 100.0, lag=lag)
+    assert allocation.cost == pytest.approx(100 * 0.01 * 0.5**lag * 0.5, rel=0.02)
+
+
 def test_from_one_asset_to_the_other_by_hand():
     """Selling 100 yields 99, which buys 98.01."""
     allocation = plan([0, 0, 1], [5, 0], 0)
@@ -244,6 +258,40 @@ def test_prices_of_another_day():
     for day in ("NaT", "today", "2025", ""):  # numpy reads these
         with pytest.raises(QfolioError, match=f"--as-of is '{day}'; it must be a date"):
             require_fresh(PRICES, day)
+    require_fresh(PRICES, "2025-01-07T23:00")  # the time counts for several rows a day alone
+    assert require_fresh(PRICES, "2025-01-01") == datetime.timedelta(days=1)
+
+
+def hourly(*hours, days=14, weekends=True):
+    """Rows at some hours of each day, up to 2024-12-31, a Tuesday."""
+    dates = np.datetime64("2024-12-31") - np.arange(days)[::-1]
+    dates = dates[weekends | np.is_busday(dates)]
+    moments = (dates[:, None] + np.array(hours, "timedelta64[h]")).ravel().astype("datetime64[s]")
+    return Prices(moments, ("A",), np.ones((len(moments), 1)))
+
+
+def test_prices_of_several_times_a_day_are_as_old_as_their_last_hour():
+    always = hourly(*range(24))
+    assert require_fresh(always, "2025-01-01T22:59") == datetime.timedelta(hours=23, minutes=59)
+    assert require_fresh(always, "2025-01-01T22:00+02:00") == datetime.timedelta(hours=21)
+    require_fresh(always, "2024-12-31")
+    with pytest.raises(QfolioError, match="end on 2024-12-31 23:00:00, after 2024-12-31 22:00:00"):
+        require_fresh(always, "2024-12-31T22:00")
+
+
+def test_prices_are_stale_a_day_after_the_longest_pause_of_their_market():
+    always, bourse = hourly(*range(24)), hourly(*range(9, 17), weekends=False)
+    message = "stale: they end on 2024-12-31 23:00:00, 26 hours before .* --as-of 2024-12-31T23:00"
+    require_fresh(always, "2025-01-01")
+    with pytest.raises(QfolioError, match=message):
+        require_fresh(always, "2025-01-02T01:00")
+    require_fresh(bourse, "2025-01-04T09:00")  # a weekend is 65 hours from close to open
+    with pytest.raises(QfolioError, match=r"stale.*, 3 days before 2025-01-04 10:00:00"):
+        require_fresh(bourse, "2025-01-04T10:00")
+    short = hourly(*range(24), days=3)  # says nothing of weekends
+    require_fresh(short, "2025-01-07")
+    with pytest.raises(QfolioError, match="stale"):
+        require_fresh(short, "2025-01-08")
 
 
 def test_rows_in_utc_are_not_after_today_in_an_evening_of_the_west(monkeypatch):
@@ -254,11 +302,11 @@ def test_rows_in_utc_are_not_after_today_in_an_evening_of_the_west(monkeypatch):
 
     monkeypatch.setattr("datetime.date", Yesterday)
     now = np.datetime64("now", "s")
-    hourly = Prices(now - np.arange(3)[::-1] * np.timedelta64(3600, "s"), ("A",), np.ones((3, 1)))
-    require_fresh(hourly, None)
+    latest = Prices(now - np.arange(3)[::-1] * np.timedelta64(3600, "s"), ("A",), np.ones((3, 1)))
+    assert require_fresh(latest, None) < datetime.timedelta(minutes=5)
     with pytest.raises(QfolioError, match="leave out the later rows"):
         require_fresh(
-            dataclasses.replace(hourly, dates=hourly.dates + np.timedelta64(1, "D")), None
+            dataclasses.replace(latest, dates=latest.dates + np.timedelta64(1, "D")), None
         )
 
 
@@ -324,3 +372,26 @@ def test_only_what_is_traded_counts_as_turnover(tmp_path):
             digests={"prices": str(lots), "settings": "", "holdings": held}, whole_shares=lots,
         )  # fmt: skip
         assert made.turnover == pytest.approx(turnover)
+
+
+def test_a_record_is_found_by_its_day_or_time(tmp_path):
+    """Of several on a day, the day alone means the last; midnight has a time of its own."""
+    ledger, policy = Ledger(tmp_path), Fixed([1, 0, 0], FREE)
+    for at in ("2024-12-31T00:00", "2024-12-31T15:00", "2024-12-31T15:00:30"):
+        dates = np.array(["2024-12-30T00:00", at], "datetime64[s]")
+        allocation = Allocation.of(
+            policy, dataclasses.replace(PRICES, dates=dates), np.zeros(2), 100.0
+        )
+        held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
+        ledger.append(
+            allocation, PRICES, keep_prices=False, agent="x", policy=None, made="", version="",
+            digests={"prices": at, "settings": "", "holdings": held}, whole_shares=False,
+        )  # fmt: skip
+    for date, number in (
+        ("2024-12-31", 3), ("2024-12-31 00:00", 1), ("2024-12-31T00:00:00", 1),
+        ("2024-12-31 15:00:00", 2), ("2024-12-31T15:00", 3), ("2024-12-31 15:00:30", 3),
+    ):  # fmt: skip
+        assert ledger.on(date).number == number
+    for date in ("2024-12-30", "2024-12", "2024-12-31 15", "2024-12-31 16:00"):
+        with pytest.raises(QfolioError, match=f"no allocation of '{date}'; its latest are of"):
+            ledger.on(date)

@@ -16,6 +16,7 @@ import pytest
 from leaning import Leaning
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.desk import allocation
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.doubts import require_plausible
 from qfolio.portfolio.desk.ledger import Ledger
@@ -44,6 +45,26 @@ def test_prices_without_an_asset_delisted_before_they_begin_are_to_begin_earlier
         desk.read(latest)
     frame[40:].to_csv(latest)
     assert desk.read(latest).assets == desk.run.prices.assets
+
+
+def test_an_allocation_knows_the_lag_of_its_run(monkeypatch, tmp_path):
+    """A cost model may depend on it, in the orders as in replay and follow."""
+    prices, used = load(write_table(tmp_path / "prices.csv")), []
+    Backtest.create(
+        prices, {"pathwise": PATHWISE}, out=tmp_path / "run", seeds=1, train="100d", test="80d",
+        lag=2, baselines=["equal-weight"],
+    ).run()  # fmt: skip
+    real = allocation.context_of
+
+    def watched(*arguments):
+        used.append(arguments[-1])
+        return real(*arguments)
+
+    monkeypatch.setattr(allocation, "context_of", watched)
+    desk = Desk.open(tmp_path / "run")
+    desk.allocate("equal-weight", capital=1000.0, as_of="2020-09-16", anyway=True)
+    desk.reproduce("2020-09-16")
+    assert used == [2, 2]
 
 
 @pytest.fixture(scope="module")

@@ -170,6 +170,61 @@ def test_a_trade_that_waits_a_row_by_hand():
     assert poor.short == 1
 
 
+def told(found, records):
+    """What a summary of a ledger says of the differences."""
+    count = len(found.returns)
+    none = np.zeros(count)
+    known = Following(
+        "x", records, found, none, none, none, "y", none, "", np.ones((3, count)), none + 1, 252,
+        None, False, "1y",
+    )  # fmt: skip
+    said = known.sentences()
+    return " ".join(each for each in said if "differed" in each or "not filled" in each)
+
+
+def test_holdings_that_differ_are_named_with_their_date_and_asset():
+    """Orders at row 10 buy 250 of each; then A has 50 less, and B is sold with 100 paid in."""
+    prices = price_table(np.full((20, 3), 1.0), dates=days(20, "2024-01-01"))
+    records = traded(prices, Proportional(0.0), [10, 15], [np.full(4, 0.25)] * 2)
+    late = msgspec.structs.replace(records[1], shares=[200.0, 0.0, 250.0], cash=600.0)
+    found = mark([records[0], late], prices, Proportional(0.0), lag=0)
+    (difference,) = found.differences
+    assert (difference.date, difference.where) == ("2024-01-16", "cash")
+    assert difference.money == pytest.approx(350)
+    assert difference.unfilled is None
+    assert told(found, records) == (
+        "Holdings differed from those expected 1 time, by +50.00 in all (deposits, other fills), "
+        "last on 2024-01-16, most in cash (+350.00); this is not counted as a return."
+    )
+    exact = mark(records, prices, Proportional(0.0), lag=0)
+    assert exact.differences == []
+    assert not told(exact, records)
+
+
+@pytest.mark.parametrize("split", [1.0, 2.0])
+@pytest.mark.parametrize("lag", [0, 1])
+def test_orders_that_were_never_filled_are_named(lag, split):
+    """The account holds 100 A, is to buy 100 B, and still holds 100 A, or 200 after a split."""
+    values = np.full((20, 3), 1.0)
+    prices = price_table(values, dates=days(20, "2024-01-01"))
+    (first,) = traded(prices, Proportional(0.0), [10], [np.array([1.0, 0, 0, 0])])
+    first = msgspec.structs.replace(
+        first, shares=[100.0, 0.0, 0.0], cash=100.0, trades=[0.0, 100.0, 0.0],
+        prices=[split, 1.0, 1.0],
+    )  # fmt: skip
+    then = msgspec.structs.replace(
+        first, number=2, date="2024-01-16", shares=[100.0 * split, 0.0, 0.0], trades=[0.0] * 3,
+        prices=[1.0] * 3,
+    )  # fmt: skip
+    found = mark([first, then], prices, Proportional(0.0), lag=lag)
+    (difference,) = found.differences
+    assert (difference.where, difference.unfilled) in [("B", first.date), ("cash", first.date)]
+    assert "orders of 2024-01-11 were not filled, since" in told(found, [first, then])
+    partly = msgspec.structs.replace(then, shares=[100.0 * split, 50.0, 0.0], cash=50.0)
+    found = mark([first, partly], prices, Proportional(0.0), lag=lag)
+    assert found.differences[0].unfilled is None
+
+
 @pytest.mark.parametrize("lag", [0, 1, 3])
 def test_a_model_knows_how_long_orders_waited(lag):
     """As in the replay, which says it, too."""

@@ -1,5 +1,7 @@
 """What is said of an allocation's orders."""
 
+import datetime
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,7 +9,15 @@ import pytest
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.costs import Proportional
 from qfolio.portfolio.desk.allocation import Allocation
-from qfolio.portfolio.desk.notes import dear, lookback, other_capital, waiting
+from qfolio.portfolio.desk.ledger import Record
+from qfolio.portfolio.desk.notes import (
+    aged,
+    dear,
+    lookback,
+    not_traded,
+    other_capital,
+    waiting,
+)
 from qfolio.portfolio.desk.untrained import Rule
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.policy import Policy
@@ -34,6 +44,47 @@ def test_orders_that_wait_for_weeks_are_named(dates, lag, said):
     found = " ".join(waiting(Prices(dates, ("A",), np.ones((len(dates), 1))), lag))
     assert said in found
     assert bool(found) == bool(said)
+
+
+def test_prices_of_several_times_a_day_say_how_old_they_are():
+    hours = np.datetime64("2024-01-05T09", "s") + np.arange(4) * np.timedelta64(1, "h")
+    table, daily = (Prices(dates, ("A",), np.ones((len(dates), 1))) for dates in (hours, DAYS))
+    assert not aged(table, datetime.timedelta(hours=2))
+    (said,) = aged(table, datetime.timedelta(hours=3))
+    assert said.startswith("The latest prices, of 2024-01-05 12:00:00, are 3 hours old;")
+    assert not aged(daily, datetime.timedelta(days=7))
+
+
+def account(shares, trades, number):
+    """A record of holdings and orders in A and B."""
+    weights = [1.0, 0.0, 0.0]
+    return Record(
+        number=number, made="", version="", agent="x", policy=None, digests={}, date="2024-01-02",
+        whole_shares=False, assets=["A", "B"], prices=[1.0, 1.0], shares=shares, cash=9.0,
+        trades=trades, cash_after=9.0, weights_before=weights, target=weights,
+        weights_after=weights, costs={},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("shares", "number"),
+    [([0, 0], 1), ([5, 0], 2), ([5, 3], None), ([0, 8], 3), ([4, 4], None)],
+)
+def test_holdings_from_before_any_earlier_orders_are_noticed(shares, number):
+    """Record 3 sees what record 2 sold in part only; record 4 orders nothing."""
+    earlier = [
+        account([0, 0], [5, 0], 1), account([5, 0], [0, 3], 2), account([0, 8], [5, -5], 3),
+        account([5, 3], [0, 0], 4),
+    ]  # fmt: skip
+    now = Allocation.of(
+        Fixed([1, 0, 0], Proportional(0.0)),
+        Prices(DAYS[:1], ("A", "B"), np.ones((1, 2))),
+        np.array(shares, float),
+        1.0,
+    )
+    said = " ".join(not_traded(now, earlier))
+    assert (f"those of record {number} before its trades" in said) == (number is not None)
+    assert bool(said) == (number is not None)
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ def tracked(mandate: Mandate, benchmark: Any, field: Field, prices: Prices) -> M
     if name not in {*prices.assets, *BASELINES, *field.baselines}:
         raise QfolioError(
             f"The mandate's tracking error cannot be measured against the benchmark {quote(name)}, "
-            "which is no asset of the table and no baseline; set risk.benchmark to one, or to "
-            "feature:NAME with its weights."
+            "which is no asset of the table and no baseline; set risk.benchmark to one, to a "
+            'baseline of your own ("module:Name"), or to feature:NAME with its weights.'
         )
     return msgspec.structs.replace(mandate, risk=msgspec.structs.replace(risk, benchmark=name))

@@ -11,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import amount, quote
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import Context, CostModel
 from qfolio.portfolio.desk.whole_shares import whole_shares as rounded
@@ -22,7 +22,8 @@ from qfolio.portfolio.prices.frequency import spacing
 from qfolio.portfolio.prices.table import Prices
 
 MAX_AGE = datetime.timedelta(days=7)
-"""Older daily prices are stale; slower ones may be older by the days between their rows."""
+"""Older daily prices are stale. Slower ones may be older by the days between their rows; prices of
+several times a day are stale a day after the longest pause between their rows of a year."""
 
 NOISE = 1e-6
 """Smaller changes of a weight are not ordered, since policies decide in float32."""
@@ -71,6 +72,7 @@ class Allocation:
         whole_shares: bool = False,
         spent: float = 0.0,
         debts: bool = True,
+        lag: int = 1,
     ) -> "Allocation":
         """The policy's target after the table's last row, and the trades from the current holding.
 
@@ -88,6 +90,7 @@ class Allocation:
             spent: Turnover since the calendar year began, for a mandate that limits it.
             debts: Whether the policy may be in debt. If not, it decides as if an overdraft, which
                 is left where prices rise before trades are filled, were repaid.
+            lag: Rows from the decision to its trades, for a cost model that depends on them.
 
         Raises:
             QfolioError: There is nothing to allocate, or the overdraft is large.
@@ -119,7 +122,7 @@ class Allocation:
         weights = _ordered(np.array([targets[name] for name in names]), held)
         trades = np.zeros(len(shares))
         conditions = Conditions.of(prices, policy.costs)
-        context = context_of(policy.costs, conditions, len(prices) - 1, wealth)
+        context = context_of(policy.costs, conditions, len(prices) - 1, wealth, lag)
         parts = parse(policy.mandate)[1].trading.fill if policy.mandate else 1
         after = partial(filled, policy.costs, context, shares, cash, known, parts)
         if not np.array_equal(weights, held):
@@ -267,9 +270,7 @@ def turnover(held: Any, reached: Any, trades: Any) -> float:
     return float(changes[np.asarray(trades) != 0].sum())
 
 
-def context_of(
-    model: CostModel, known: Conditions, row: int, wealth: float, lag: int = 1
-) -> Context:
+def context_of(model: CostModel, known: Conditions, row: int, wealth: float, lag: int) -> Context:
     """The circumstances of a trade at a row, ``lag`` rows after its decision."""
     capital = model.capital if isinstance(model, Itemized) else wealth
     return known.trade(row, lag, wealth / capital)
@@ -333,28 +334,61 @@ def settled(
     return cash, {kind: wealth * float(share) for kind, share in costs.items()}
 
 
-def require_fresh(prices: Prices, as_of: str | datetime.date | None) -> None:
-    """Raises QfolioError unless prices end shortly before ``as_of`` (default: today)."""
-    given = datetime.date.today() if as_of is None else as_of
+def require_fresh(prices: Prices, as_of: str | datetime.date | None) -> datetime.timedelta:
+    """Raises QfolioError unless prices end shortly before ``as_of``; returns how old they are.
+
+    as_of: A day or, for prices of several times a day, a moment in UTC (default: now).
+    """
+    last = prices.dates[-1].astype("datetime64[s]").item()
+    steps, usual = spacing(prices.dates) if len(prices) > 1 else (np.ones(1), 1.0)
+    several = usual < 1
+    now = datetime.datetime.now(datetime.UTC).replace(tzinfo=None, microsecond=0)
+    given = (now if several else datetime.date.today()) if as_of is None else _when(as_of)
+    if isinstance(given, datetime.datetime) and not several:
+        given = given.date()
+    exact = isinstance(given, datetime.datetime)
+    end = last if exact else last.date()
+    age = given - end
+    early = age < datetime.timedelta()
+    if exact and as_of is None:  # times may be local: it is later in Tokyo than in UTC
+        early = last.date() > max(datetime.date.today(), now.date())
+        age = max(age, datetime.timedelta())
+    if early:
+        raise QfolioError(
+            f"The prices end on {end}, after {given}; leave out the later rows, or set a later "
+            "--as-of."
+        )
+    limit = MAX_AGE + datetime.timedelta(days=max(0, round(usual) - 1))
+    if several and steps.sum() > MAX_AGE.days:  # no market that the table knows rests for longer
+        longest = float(steps[-round(prices.periods_per_year) :].max())
+        limit = min(MAX_AGE, datetime.timedelta(days=longest + 1))
+    if age > limit:
+        raise QfolioError(
+            f"The prices are stale: they end on {end}, {duration(age)} before {given}; "
+            f"give the latest with --prices, or set --as-of {end.isoformat()}."
+        )
+    return age
+
+
+def duration(age: datetime.timedelta) -> str:
+    """A length of time in whole hours, or in days from two days on."""
+    hours = age // datetime.timedelta(hours=1)
+    return amount(hours, "hour") if hours < 48 else amount(hours // 24, "day")
+
+
+def _when(as_of: str | datetime.date) -> datetime.date:
+    """A day, or a moment in UTC."""
     try:
-        today = datetime.date.fromisoformat(str(given))
+        return datetime.date.fromisoformat(str(as_of))
+    except ValueError:
+        pass
+    try:
+        moment = datetime.datetime.fromisoformat(str(as_of))
     except ValueError:
         raise QfolioError(
-            f"--as-of is {quote(as_of)}; it must be a date such as 2025-12-31."
+            f"--as-of is {quote(as_of)}; it must be a date such as 2025-12-31 or, for prices of "
+            "several times a day, a time such as 2025-12-31T15:00."
         ) from None
-    last = prices.dates[-1].astype("datetime64[D]").item()
-    usual = spacing(prices.dates)[1] if len(prices) > 1 else 1.0
-    newest = today
-    if usual < 1 and as_of is None:
-        # Several rows a day are in UTC, where the next day has begun in an American evening.
-        newest = max(today, datetime.datetime.now(datetime.UTC).date())
-    if last > newest:
-        raise QfolioError(
-            f"The prices end on {last}, after {today}; leave out the later rows, or set "
-            "a later --as-of."
-        )
-    if today - last > MAX_AGE + datetime.timedelta(days=max(0, round(usual) - 1)):
-        raise QfolioError(
-            f"The prices are stale: they end on {last}, {(today - last).days} days before {today}; "
-            f"give the latest with --prices, or set --as-of {last}."
-        )
+    if moment.tzinfo is not None:
+        moment = moment.astimezone(datetime.UTC).replace(tzinfo=None)
+    return moment

@@ -252,7 +252,7 @@ class Desk:
         if table.levels:
             in_shares = whole_shares or holdings is not None or orders is not None
             _require_weights_alone(followed, in_shares)
-        require_fresh(table, as_of)
+        age = require_fresh(table, as_of)
         held = read_holdings(source, table.assets, capital, debts=self.debts)
         shares, cash, said = cashed_out(*held, table)
         if not anyway:
@@ -280,6 +280,7 @@ class Desk:
             whole_shares=whole_shares,
             spent=spent,
             debts=self.debts,
+            lag=self.run.config.lag,
         )
         wanted = None
         if place is not None:
@@ -291,6 +292,7 @@ class Desk:
             said = [*(f"Why {sentence(reason)}" for reason in why), *said]
         else:
             said = [*said, *followed.notes(table, allocation.held, spent=spent)]
+        said += notes.aged(table, age)
         said += self.terms(followed, table, allocation, spent)
         record, done = None, "A dry run: nothing is written."
         if not dry_run:
@@ -449,9 +451,15 @@ class Desk:
                 "ledger; restore them."
             )
         spent = self.spent(followed, table, record.number)
-        whole = record.whole_shares
         remade = Allocation.of(
-            followed, table, shares, cash, whole_shares=whole, spent=spent, debts=self.debts
+            followed,
+            table,
+            shares,
+            cash,
+            whole_shares=record.whole_shares,
+            spent=spent,
+            debts=self.debts,
+            lag=self.run.config.lag,
         )
         off = float(abs(remade.weights - np.array(record.target)).max())
         if off > SAME:

@@ -20,7 +20,7 @@ from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.ledger import Record
 from qfolio.portfolio.desk.live import Live, mark
 from qfolio.portfolio.desk.reference import reference
-from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.findings import day, first_of
 from qfolio.portfolio.prices.table import Prices
 
 COLUMNS = (
@@ -119,12 +119,17 @@ class Following:
                 f"wealth, and the mandate's margin allows {self.called:.3g}; allocate again."
             )
         said += [self._retrain(), *([self.note] if self.note else [])]
-        flows = live.flows[abs(live.flows) > 1e-6 * abs(live.wealth)]
-        if flows.size:
+        if live.differences:
+            last = live.differences[-1]
             said.append(
-                f"Holdings differed from those expected {amount(flows.size, 'time')}, by "
-                f"{flows.sum():+,.2f} in all (deposits, other fills); this is not counted as a "
-                "return."
+                f"Holdings differed from those expected {amount(len(live.differences), 'time')}, "
+                f"by {live.flows.sum():+,.2f} in all (deposits, other fills), last on {last.date}, "
+                f"most in {last.where} ({last.money:+,.2f}); this is not counted as a return."
+            )
+        if unfilled := [found.unfilled for found in live.differences if found.unfilled]:
+            said.append(
+                f"The orders of {first_of(unfilled)} were not filled, since the next holdings are "
+                "those before them; live returns count them as if they had been."
             )
         if live.short:
             said.append(

@@ -115,11 +115,20 @@ class Ledger:
     def on(self, date: str) -> Record:
         """The record that counts for a date; for a day, that of its last moment.
 
+        date: Such as 2025-12-31 or, where there are several a day, 2025-12-31 15:00.
+
         Raises QfolioError if there is none.
         """
-        found = [record for record in self.current() if date in (record.date, record.date[:10])]
+        records, wanted = self.current(), date.replace("T", " ")
+        moments = [str(record.moment).replace("T", " ") for record in records]
+        # To the day, the minute or the second.
+        found = [
+            record
+            for record, moment in zip(records, moments, strict=True)
+            if wanted in (moment[:10], moment[:16], moment)
+        ]
         if not found:
-            known = ", ".join(record.date for record in self.current()[-3:])
+            known = ", ".join(record.date for record in records[-3:])
             raise QfolioError(
                 f"The ledger has no allocation of {quote(date)}; "
                 + (f"its latest are of {known}." if known else "it is empty.")

@@ -15,6 +15,19 @@ from qfolio.portfolio.prices.table import Prices
 
 
 @dataclass(frozen=True)
+class Difference:
+    """Holdings given to an allocation that are not those expected.
+
+    unfilled: date of the orders before, if the holdings are those before these; else None.
+    """
+
+    date: str  # of the allocation
+    where: str  # the asset that differs most in value, or cash
+    money: float  # by which it does
+    unfilled: str | None
+
+
+@dataclass(frozen=True)
 class Live:
     """Rows since the first trade; arrays of shape (rows,)."""
 
@@ -27,6 +40,7 @@ class Live:
     gross: np.ndarray  # absolute values of assets, as a multiple of wealth; infinite without any
     first: int  # row of the table before the first return
     short: int  # number of trades that left an overdraft
+    differences: list[Difference]
 
     @property
     def ruin(self) -> np.datetime64 | None:
@@ -83,6 +97,7 @@ def mark(
         at[row] = record, fill
     first = int(rows[0])
     account = _Account(prices, model, lag, band)
+    differences: list[Difference] = []
     base = total = 0.0
     paid = flow = 0.0
     table: list[tuple[float, ...]] = []
@@ -96,6 +111,8 @@ def mark(
                 table.append((earned, total, account.cash, paid, flow, account.gross(row)))
         paid, flow = account.fill(row) if lag else 0.0, 0.0
         if row in at:
+            if row > first:
+                differences += account.differences(at[row][0], row)
             flow = account.take(*at[row], row) - (total - paid)
             if row == first:
                 total, flow = total + flow, 0.0
@@ -104,7 +121,8 @@ def mark(
         base = total + flow
     returns, wealth, money, costs, flows, gross = np.array(table).reshape(-1, 6).T
     dates = prices.dates[first + lag + 1 :]
-    return Live(dates, returns, wealth, money, costs, flows, gross, first + lag, account.short)
+    columns = (returns, wealth, money, costs, flows, gross)
+    return Live(dates, *columns, first + lag, account.short, differences)
 
 
 class _Account:
@@ -119,6 +137,7 @@ class _Account:
         self._known = Conditions.of(prices, model)
         self._due: dict[int, np.ndarray] = {}  # by row
         self._loan = False  # whether negative cash was wanted
+        self._taken: tuple[Record, np.ndarray] | None = None  # the last one, and its units
         self.units, self.cash, self.short = np.zeros(self._values.shape[1]), 0.0, 0
 
     def wealth(self, row: int) -> float:
@@ -144,15 +163,33 @@ class _Account:
             self.units = np.where(gone, 0.0, self.units)
             self._due = {then: np.where(gone, 0.0, part) for then, part in self._due.items()}
 
+    def _scale(self, record: Record, row: int) -> np.ndarray:
+        """Units of the table for each share of a record: prices may have been adjusted since."""
+        values, prices = self._values[row], np.array([price or 0.0 for price in record.prices])
+        return np.divide(prices, values, out=np.ones(len(values)), where=values > 0)
+
+    def differences(self, record: Record, row: int) -> list[Difference]:
+        """Where the holdings of a later record are not those expected; at most one."""
+        given = np.array(record.shares) * self._scale(record, row)
+        off = np.append(record.cash - self.cash, (given - self.units) * self._values[row])
+        most = int(abs(off).argmax())
+        if not abs(off[most]) > 1e-6 * abs(self.wealth(row)):
+            return []
+        assert self._taken is not None
+        before, units = self._taken
+        same = np.allclose(given, units, rtol=1e-6) and not np.allclose(self.units, units)
+        where = ("cash", *record.assets)[most]
+        return [Difference(record.date, where, float(off[most]), before.date if same else None)]
+
     def take(self, record: Record, fill: int, row: int) -> float:
         """Takes an allocation's holdings and orders; returns the wealth of these holdings.
 
         fill: rows over which the orders are filled.
         """
-        values, prices = self._values[row], np.array([price or 0.0 for price in record.prices])
-        scale = np.divide(prices, values, out=np.ones(len(values)), where=values > 0)
+        scale = self._scale(record, row)
         self._loan = record.target[0] < -1e-6
         self.units, self.cash = np.array(record.shares) * scale, record.cash
+        self._taken = record, self.units
         # Earlier orders go on until this one takes the place of what is left of them.
         if record.replaces(self._band):
             first, part = row + self._lag, np.array(record.trades) * scale / fill

@@ -1,5 +1,6 @@
 """What the desk has to say of an allocation besides its figures, in sentences."""
 
+import datetime
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +12,7 @@ from qfolio.portfolio.backtest.baselines.base import window_rows
 from qfolio.portfolio.backtest.folds import latest
 from qfolio.portfolio.calendars import band, decision_rows
 from qfolio.portfolio.costs import CostModel
-from qfolio.portfolio.desk.allocation import NOISE, Allocation
+from qfolio.portfolio.desk.allocation import NOISE, Allocation, duration
 from qfolio.portfolio.desk.ledger import Record
 from qfolio.portfolio.desk.untrained import Ordered, Rule, Untrained
 from qfolio.portfolio.itemized import Itemized
@@ -115,17 +116,34 @@ def lookback(
     return what, min(found[what], len(dates))
 
 
-def not_traded(allocation: Allocation, earlier: Sequence[Record]) -> list[str]:
-    """Says so if the holdings are those of the latest earlier record before its trades."""
-    if not earlier or not any(earlier[-1].trades):
-        return []
-    # Cash may have earned interest since, or paid a fee.
-    if not np.allclose(allocation.shares, earlier[-1].shares, rtol=1e-9, atol=1e-5):
+def aged(table: Prices, age: datetime.timedelta) -> list[str]:
+    """Says so if prices of several times a day are older than two of their rows."""
+    usual = spacing(table.dates)[1] if len(table) > 1 else 1.0
+    if usual >= 1 or age <= datetime.timedelta(days=2 * usual):
         return []
     return [
-        f"The holdings are those of record {earlier[-1].number} before its trades; if "
-        "these were filled, export the holdings again."
+        f"The latest prices, of {day(table.dates[-1])}, are {duration(age)} old; the orders are "
+        "made at them."
     ]
+
+
+def not_traded(allocation: Allocation, earlier: Sequence[Record]) -> list[str]:
+    """Says so if the holdings are those of an earlier record before its trades.
+
+    They are not, if they are also those of a later record, or the same, after its trades.
+    """
+    for record in reversed(earlier):
+        # Cash may have earned interest since, or paid a fee.
+        before = np.allclose(allocation.shares, record.shares, rtol=1e-9, atol=1e-5)
+        if before and any(record.trades):
+            return [
+                f"The holdings are those of record {record.number} before its trades; if "
+                "these were filled, export the holdings again."
+            ]
+        after = np.add(record.shares, record.trades)
+        if np.allclose(allocation.shares, after, rtol=1e-9, atol=1e-5):
+            break
+    return []
 
 
 def nothing_ordered(allocation: Allocation, calendar: str) -> list[str]:
