@@ -36,6 +36,7 @@ def table(rows: int = 700) -> Prices:
     ("calendar", "rows"),
     [
         ("", range(10)),
+        ("daily", range(10)),
         ("weekly", [0, 2, 4, 5, 6, 7, 9]),
         ("monthly", [0, 2, 5, 6, 7]),
         ("quarterly", [0, 2, 7]),
@@ -48,8 +49,13 @@ def test_rows_of_decisions(calendar: str, rows: list[int]) -> None:
     assert np.flatnonzero(decision_rows(calendar, DAYS)).tolist() == list(rows)
 
 
+def test_a_day_of_several_rows_decides_once() -> None:
+    hours = np.datetime64("2024-01-05T22", "s") + np.arange(6) * np.timedelta64(1, "h")
+    assert np.flatnonzero(decision_rows("daily", hours)).tolist() == [0, 2]
+
+
 def test_later_rows_decide_nothing() -> None:
-    for calendar in ("weekly", "monthly", "quarterly", "yearly", "3"):
+    for calendar in ("daily", "weekly", "monthly", "quarterly", "yearly", "3"):
         whole = decision_rows(calendar, DAYS)
         for end in range(len(DAYS)):
             assert (decision_rows(calendar, DAYS[:end]) == whole[:end]).all()
@@ -57,13 +63,13 @@ def test_later_rows_decide_nothing() -> None:
 
 @pytest.mark.parametrize(
     "calendar",
-    ["daily", "0", "-3", "2.5", "9" * 30, "Monthly", "drift:", "drift:0", "drift:1", "drift:nan"],
+    ["hourly", "0", "-3", "2.5", "9" * 30, "Monthly", "drift:", "drift:0", "drift:1", "drift:nan"],
 )
 def test_unknown_calendars(calendar: str) -> None:
     with pytest.raises(QfolioError) as raised:
         Portfolio.of(table(), calendar=calendar)
     said = str(raised.value)
-    assert "weekly, monthly, quarterly, yearly, a number of rows, or drift:" in said
+    assert "daily, weekly, monthly, quarterly, yearly, a number of rows, or drift:" in said
     assert "leave it out to trade at every row" in said
 
 

@@ -58,9 +58,9 @@ class Options(Reading):
             they take precedence over the file.
         cost_model: Cost of trading and holding: proportional, itemized or your own as module:Name;
             settings follow in brackets, as in "itemized(fixed=5, cash_rate=0.03)".
-        calendar: When all strategies may trade: weekly, monthly, quarterly, yearly, a number of
-            rows, or drift:0.05 to trade when a weight is more than 0.05 from its target (default:
-            at every row; baselines keep their own calendars).
+        calendar: When all strategies may trade: daily, weekly, monthly, quarterly, yearly, a number
+            of rows, or drift:0.05 to trade when a weight is more than 0.05 from its target
+            (default: at every row; baselines keep their own calendars).
         signals: Signals that agents observe beside returns, separated by commas, each with its
             lookback and the latest rows that it skips (drift and volatility-ratio: that it
             measures), in rows (momentum:252-21) or as times (momentum:1y-1m), or your own as

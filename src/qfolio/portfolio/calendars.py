@@ -6,7 +6,13 @@ from numpy.typing import NDArray
 from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 
-PERIODS = {"weekly": "week", "monthly": "month", "quarterly": "quarter", "yearly": "year"}
+PERIODS = {
+    "daily": "day",
+    "weekly": "week",
+    "monthly": "month",
+    "quarterly": "quarter",
+    "yearly": "year",
+}
 """Calendars that are named after their periods, and the periods."""
 
 DRIFT = "drift:"
@@ -17,10 +23,10 @@ def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> Bools:
     """Whether a decision is due at each row, of shape (row,).
 
     Args:
-        calendar: "weekly", "monthly", "quarterly" or "yearly" for the first row of each period,
-            which is known without later rows; a number k for every k-th row; "" or "drift:BAND" for
-            every row.
-        dates: Dates of the rows.
+        calendar: "daily", "weekly", "monthly", "quarterly" or "yearly" for the first row of each
+            period, which is known without later rows; a number k for every k-th row; "" or
+            "drift:BAND" for every row.
+        dates: Dates of the rows; days begin at midnight of their clock.
 
     Raises:
         QfolioError: There is no such calendar.
@@ -32,8 +38,8 @@ def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> Bools:
         days = dates.astype("datetime64[D]").astype(int)
         months = dates.astype("datetime64[M]").astype(int)
         weeks = (days + 3) // 7  # 1970-01-01 was a Thursday; weeks begin on Monday
-        numbers = dict(zip(PERIODS, (weeks, months, months // 3, months // 12), strict=True))
-        period = numbers[calendar]
+        numbers = days, weeks, months, months // 3, months // 12
+        period = dict(zip(PERIODS, numbers, strict=True))[calendar]
         return np.diff(period, prepend=period[:1] - 1) > 0
     if calendar.isdecimal() and len(calendar) <= 9 and int(calendar) > 0:
         return rows % int(calendar) == 0

@@ -151,9 +151,9 @@ class Backtest:
             cost_model: Cost of trading and holding, in training and replay: a name of the registry,
                 or your own as ``module:Name``, with its settings as in "itemized(fixed=5)"; a cost
                 among them precedes all others.
-            calendar: When all strategies may trade: weekly, monthly, quarterly or yearly, on the
-                first row of each period; every so many rows; or "drift:0.05", when some weight is
-                more than 0.05 from its target (default: at every row, and baselines by their own
+            calendar: When all strategies may trade: daily, weekly, monthly, quarterly or yearly, on
+                the first row of each period; every so many rows; or "drift:0.05", when some weight
+                is more than 0.05 from its target (default: at every row, and baselines by their own
                 calendars). All may trade on the first row of the test.
             baselines: Names of the registry, or your own as ``module:Name``; equal weights are
                 always included.

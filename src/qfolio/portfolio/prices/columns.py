@@ -7,7 +7,7 @@ import numpy as np
 
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.bars import columns_of_kind, pick_prices
-from qfolio.portfolio.prices.cells import is_missing, numbers
+from qfolio.portfolio.prices.cells import is_missing, is_number, numbers
 from qfolio.portfolio.prices.dates import are_times, read_dates, readable_date
 from qfolio.portfolio.prices.findings import LISTED, Findings, listing
 from qfolio.portfolio.prices.layout import Table
@@ -101,7 +101,7 @@ def find_columns(
     if label is not None and price is not None:
         own = tuple(Feature((single[name],), name not in shared) for name in features)
         return Columns(when, time, label, (), (price,), own)
-    _check_wide(table, others, findings)
+    _check_wide(table, others, when, findings)
     if findings.bad:
         return None
     assets, prices = pick_prices(table, others, findings)
@@ -241,18 +241,33 @@ def _are_labels(cells: np.ndarray) -> bool:
     return bool((values == np.rint(values)).all()) and 0 < different <= max(1, len(values) // 10)
 
 
-def _check_wide(table: Table, columns: list[int], findings: Findings) -> None:
+def _check_wide(table: Table, columns: list[int], when: int, findings: Findings) -> None:
+    """Finds columns without a name, and names of assets, which only a long table has."""
+    moments = read_dates(table.columns[when]).moments
+    again = len(np.unique(moments)) < len(moments)
     for j in columns:
         if not table.names[j]:
             findings.error(f"column {j + 1} has no name", advice="Name it or remove it.")
-        cells = table.columns[j][:LOOKED_AT]
-        if (
-            plain(table.names[j]) in ASSET_NAMES
-            and np.isnan(numbers(cells)[0]).all()
-            and not _is_blank(cells)
-        ):
+        if not _holds_words(table.columns[j][:LOOKED_AT]):
+            continue
+        if plain(table.names[j]) in ASSET_NAMES:
             findings.error(
                 "holds names of assets, but no column is called price or close",
                 column=table.names[j],
                 advice="Name the column of prices 'price'.",
             )
+        elif again:
+            findings.error(
+                "holds names, and dates repeat, as in a table with a row for each date and asset",
+                column=table.names[j],
+                advice="Name the column of assets 'asset' and that of prices 'price'.",
+            )
+
+
+def _holds_words(cells: np.ndarray) -> bool:
+    """Whether a column has cells, and none is a number with either decimal mark."""
+    known = [cell for cell in cells.tolist() if not is_missing(cell)]
+    words = (
+        isinstance(cell, str) and not is_number(cell) and not is_number(cell, ",") for cell in known
+    )
+    return bool(known) and all(words)

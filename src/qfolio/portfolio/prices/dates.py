@@ -64,10 +64,10 @@ def read_dates(cells: np.ndarray, *, by_day: bool = False) -> Dates:
     """A column of cells as dates.
 
     Accepts dates and times, ISO 8601 and similar texts (2020-01-31, 2020/1/31, 20200131,
-    2020-01-31 16:00+01:00), and 31/01/2020 or 01/31/2020 if at least one cell of the column shows
-    which number is the day. Time zones are dropped: if all times are midnight in their own zones,
-    the dates are kept; otherwise times are converted to UTC. A column that holds only numbers may
-    count one of ``UNITS``.
+    2020-01-31 16:00+01:00), 31.01.2020, and 31/01/2020 or 01/31/2020 if at least one cell of the
+    column shows which number is the day. Time zones are dropped: if all times are midnight in
+    their own zones, the dates are kept; otherwise times are converted to UTC. A column that holds
+    only numbers may count one of ``UNITS``.
 
     by_day: whether dates are also kept if each is of another day in its zone. Only for prices:
     what is known beside several prices a day must not be dated earlier than it was known.
@@ -180,6 +180,8 @@ def _of_calendar(cells: np.ndarray, by_day: bool) -> list[datetime | str]:
     ends = [match for match in map(_year_last, cells) if match]
     day_first, month_first = (any(int(match[k]) > 12 for match in ends) for k in (1, 2))
     order = None if day_first == month_first else "day" if day_first else "month"
+    if ends and not (day_first or month_first) and all("." in match[0][1:3] for match in ends):
+        order = "day"  # wherever dates are written with points
     moments = [_moment(cell, order) for cell in cells]
     aware = [m for m in moments if isinstance(m, datetime) and m.tzinfo]
     midnight = all(not (m.hour or m.minute or m.second) for m in aware)
