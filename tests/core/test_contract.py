@@ -191,6 +191,22 @@ def test_an_error_in_own_code_stays_as_it_is():
     assert one_line(caught.value).startswith("KeyError: 'mine' (test_contract.py, line ")
 
 
+@pytest.mark.parametrize(
+    "use",
+    [bool, int, float, np.asarray, range, lambda x: x[None][x[None] > 0]],
+    ids=["if", "int", "float", "numpy", "for", "mask"],
+)
+def test_python_cannot_take_values_of_compiled_code(use):
+    def step(self, state, action, key):
+        use(state.sum().astype(jnp.int32))
+
+    with pytest.raises((TypeError, IndexError)) as caught:
+        begun(changed(Walk, "step", step), Learner())
+    said = one_line(caught.value)
+    assert "use jax.numpy, jnp.where or jax.lax (test_contract.py, line " in said
+    assert len(said) < 230
+
+
 def test_a_place_in_a_library_is_not_where_to_look():
     with pytest.raises(TypeError) as caught:
         jnp.reshape(jnp.zeros(3), 4)

@@ -110,11 +110,13 @@ def _is(value: object, kinds: type | UnionType | tuple[type, ...]) -> bool:
 
 def one_line(error: BaseException) -> str:
     """An exception from a user's code, on one line: its type, message and location."""
-    message = " ".join(str(error).split()).rstrip(".")
+    kind = type(error)
+    traced = kind.__module__ == "jax.errors" and kind.__name__ in _TRACED
+    message = _COMPILED if traced else " ".join(str(error).split()).rstrip(".")
     frames = traceback.extract_tb(error.__traceback__)
     known = [frame for frame in frames if not frame.filename.startswith("<")]
     frame = own_frame(error) or (known[-1] if known else None)
-    text = f"{type(error).__name__}: {message}" if message else type(error).__name__
+    text = f"{kind.__name__}: {message}" if message else kind.__name__
     if isinstance(error, SyntaxError) or not frame:  # a SyntaxError's message names the place
         return text
     return f"{text} ({PurePath(frame.filename).name}, line {frame.lineno})"
@@ -156,6 +158,20 @@ def own_frame(error: BaseException) -> traceback.FrameSummary | None:
             return frame
     return None
 
+
+_TRACED = (
+    "ConcretizationTypeError",
+    "NonConcreteBooleanIndexError",
+    "TracerArrayConversionError",
+    "TracerBoolConversionError",
+    "TracerIntegerConversionError",
+)
+"""Errors of jax whose message explains tracing, at places within qfolio."""
+
+_COMPILED = (
+    "this code is compiled before its values are known, so numpy, if, while, int and float cannot "
+    "take them; use jax.numpy, jnp.where or jax.lax"
+)
 
 _NOT_OWN = [
     str(Path(__file__).parents[1]),
