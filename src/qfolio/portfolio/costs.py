@@ -19,7 +19,7 @@ where the sums run over the assets, without cash. It holds for negative weights,
 """
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -108,15 +108,20 @@ class CostModel(abc.ABC):
         """Growth factors of a loan and of assets sold short (default: None, those of ``carry``)."""
         return None
 
-    def growth(self, weights: Any, relatives: Any, context: Context) -> Any:
-        """Growth factors of each entry of a holding, of shape (..., N + 1), by its sign."""
+    def factors(self, relatives: Any, context: Context) -> list[Any]:
+        """Growth factors of what is owned and of what is owed, each of shape (..., N + 1).
+
+        There is only the first if they are the same. Assets delisted by then have earned what cash
+        does.
+        """
         owned, owed = self.carry(relatives, context), self.owe(relatives, context)
         cash = owned[..., :1]
-        owned = delisted(owned, relatives, context.listed, cash)
-        if owed is None:
-            return owned
-        owed = delisted(owed, relatives, context.listed, cash)
-        return weights.__array_namespace__().where(weights < 0, owed, owned)
+        found = [owned] if owed is None else [owned, owed]
+        return [delisted(each, relatives, context.listed, cash) for each in found]
+
+    def growth(self, weights: Any, relatives: Any, context: Context) -> Any:
+        """Growth factors of each entry of a holding, of shape (..., N + 1), by its sign."""
+        return by_sign(weights, self.factors(relatives, context))
 
     def worth(self, weights: Any, relatives: Any, context: Context) -> Any:
         """What a holding is worth after a period, as a multiple of its worth before, (...)."""
@@ -126,6 +131,13 @@ class CostModel(abc.ABC):
         """Weights after a holding period without a trade; assets delisted by then are cash."""
         after = grown(weights, self.growth(weights, relatives, context))
         return after if context.listed is None else cashed(after, context.listed)
+
+
+def by_sign(weights: Any, factors: Sequence[Any]) -> Any:
+    """The factors of a holding's entries, by the signs of their weights: owned, then owed."""
+    if len(factors) == 1:
+        return factors[0]
+    return weights.__array_namespace__().where(weights < 0, factors[1], factors[0])
 
 
 def require_sound(model: CostModel, trade: Context, relatives: Any, holding: Context) -> None:

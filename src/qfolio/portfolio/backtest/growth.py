@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.costs import CostModel, cashed, delisted
+from qfolio.portfolio.costs import CostModel, by_sign, cashed
 
 Rows = NDArray[np.intp] | np.intp | int
 
@@ -34,8 +34,7 @@ class Growth:
             return [np.asarray(index[end] / index[start]) for index in self._index]
         relatives = self.prices[end] / self.prices[start]
         context = self.conditions.holding(start + self.first, end + self.first)
-        found = self.costs.carry(relatives, context), self.costs.owe(relatives, context)
-        return [np.asarray(growth) for growth in found if growth is not None]
+        return [np.asarray(growth) for growth in self.costs.factors(relatives, context)]
 
     def held(self, weights: Floats, start: int, end: int) -> Floats:
         """Weights of shape (N + 1,) at a row, drifted to another; cash once all is lost.
@@ -49,25 +48,15 @@ class Growth:
         return after if listed is None else np.asarray(cashed(after, listed[end + self.first]))
 
     def _indices(self) -> list[Floats]:
-        """The product of growth factors from the first row to each.
-
-        An asset that is delisted within a period then earns what cash does for the rest of it.
-        """
+        """The products of growth factors from the first row to each."""
         start = np.arange(len(self.prices) - 1)
         relatives = self.prices[1:] / self.prices[:-1]
         context = self.conditions.holding(start + self.first, start + self.first + 1)
-        found = self.costs.carry(relatives, context), self.costs.owe(relatives, context)
-        ones, cash = np.ones((1, relatives.shape[1] + 1)), found[0][..., :1]
+        ones = np.ones((1, relatives.shape[1] + 1))
         return [
-            np.cumprod(np.concatenate([ones, delisted(x, relatives, context.listed, cash)]), axis=0)
-            for x in found
-            if x is not None
+            np.cumprod(np.concatenate([ones, growth]), axis=0)
+            for growth in self.costs.factors(relatives, context)
         ]
-
-
-def by_sign(weights: Floats, growth: list[Floats]) -> Floats:
-    """The growth factors of a holding's entries, by the signs of their weights."""
-    return growth[0] if len(growth) == 1 else np.where(weights < 0, growth[1], growth[0])
 
 
 def filled_in(values: ArrayLike) -> tuple[Floats, Bools]:

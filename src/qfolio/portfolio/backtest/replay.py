@@ -21,7 +21,7 @@ from qfolio.portfolio.backtest.own import Placed, compliance
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.backtest.statistics.assessment import Strategy
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.costs import CostModel, delisted
+from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.execution import Terms
 from qfolio.portfolio.following import begin, follow, ordered
 from qfolio.portfolio.mandate import checks
@@ -129,8 +129,7 @@ class Replay:
         Where an asset has no price, its factor is that of cash.
         """
         context = self._conditions.holding(self.rows, self.rows + 1)
-        growth = np.asarray(self.task.costs.carry(self.relatives, context))
-        growth = np.array(delisted(growth, self.relatives, context.listed, growth[:, :1]))
+        growth = np.array(self.task.costs.factors(self.relatives, context)[0])
         unpriced = np.isnan(self.prices.values[self.rows])
         growth[:, 1:] = np.where(unpriced, growth[:, :1], growth[:, 1:])
         return growth

@@ -19,12 +19,13 @@ from numpy.typing import ArrayLike
 
 from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.growth import Growth, Rows, by_sign, filled_in
+from qfolio.portfolio.backtest.growth import Growth, Rows, filled_in
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import (
     Context,
     CostModel,
     Proportional,
+    by_sign,
     cashed,
     traded,
     with_cash,
