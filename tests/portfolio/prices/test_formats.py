@@ -315,9 +315,82 @@ def test_faults_of_a_turned_table_are_named_where_they_are(tmp_path: Path):
     assert load(frame).values[:, 0].tolist() == [1, 2, 3, 4]
 
 
-def test_lines_above_the_table(tmp_path: Path):
-    text = "Data of a vendor\n\ndate,A\n" + rows(ISO, [["1"]] * 4)
+@pytest.mark.parametrize(
+    "above", ["Data of a vendor\n\n", "Prices, returns, volumes, and\nothers\n", "\na;b;c;d\n"]
+)
+@pytest.mark.parametrize(("mark", "point"), [(",", "."), (";", ","), ("\t", ".")])
+def test_lines_above_the_table(tmp_path: Path, above: str, mark: str, point: str):
+    cells = [["1.25", "2.5"], ["1.5", "2.75"], ["1.75", "3.5"]]
+    lines = [mark.join(row).replace(".", point) for row in cells]
+    body = f"date{mark}A{mark}B\n" + "".join(
+        f"{day}{mark}{line}\n" for day, line in zip(ISO[:3], lines, strict=True)
+    )
+    path = write(tmp_path, above + body)
+    np.testing.assert_array_equal(load(path).values, np.array(cells, float))
+    count = above.count("\n") + 1
+    assert f"the lines above row {count} are left out" in notes(path)
+    wrong = write(tmp_path, above + body.replace(f"{ISO[1]}{mark}1", f"{ISO[1]}{mark}x"))
+    assert f"row {count + 2} (" in refusal(wrong)
+
+
+def test_lines_above_that_hide_the_names(tmp_path: Path):
+    text = "Data of a vendor\n\ndate,A\nday,euro\n" + rows(ISO, [["1"]] * 4)
     assert "remove the lines above the names of the columns" in refusal(write(tmp_path, text))
+
+
+FRENCH = """This file was created using the 202312 CRSP database, in percent.
+It contains value- and equal-weighted returns for 3 industry portfolios.
+
+Missing data are indicated by -99.99 or -999.
+
+  Average Value Weighted Returns -- Monthly
+      ,Agric,Food ,Soda
+{}
+
+  Average Equal Weighted Returns -- Monthly
+      ,Agric,Food ,Soda
+192607,   1.00,   1.00,   1.00
+192608,   1.00,   1.00,   1.00
+
+Copyright 2023
+"""
+
+
+def test_tables_of_kenneth_french(tmp_path: Path):
+    """The first table of several below sentences, with months and marks of missing returns."""
+    months = [f"{1926 + k // 12}{k % 12 + 1:02d}" for k in range(6, 30)]
+    returns = [[1.0, -2.0, -999 if k < 3 else 0.5] for k in range(24)]
+    returns[2][2] = -99.99
+    lines = [f"{m}," + ",".join(f"{x:7.2f}" for x in row)
+             for m, row in zip(months, returns, strict=True)]  # fmt: skip
+    path = write(tmp_path, FRENCH.format("\n".join(lines)))
+    prices, findings = inspect(path, returns="percent", late="join")
+    assert prices is not None
+    assert prices.assets == ("Agric", "Food", "Soda")
+    assert prices.dates[[0, -1]].astype("datetime64[D]").astype(str).tolist() == [
+        "1926-07-01", "1928-06-01",
+    ]  # fmt: skip
+    np.testing.assert_allclose(prices.relatives[3:], [[1.01, 0.98, 1.005]] * 20)
+    assert prices.first_rows.tolist() == [0, 0, 2]
+    said = [finding.message for finding in findings if finding.severity == "note"]
+    assert said[0] == (
+        "the lines above row 7 are left out, and so is what follows the blank row 32: "
+        "'Average Equal Weighted Returns -- Monthly' …"
+    )
+    assert said[1].startswith("3 returns of −99.99 or −999 percent, which mark missing ones")
+
+
+@pytest.mark.parametrize(
+    "days",
+    [
+        [f"2001{k:02d}" for k in range(1, 12)],  # months of 2001 or days of January 2020
+        [f"20{k:02d}01" for k in range(1, 13)] + ["210101"],  # years, or the first of each month
+        [f"2001{k:02d}" for k in range(1, 14)],  # days, since there is no month 13
+    ],
+)
+def test_six_digits_that_may_be_days(tmp_path: Path, days: list[str]):
+    path = write(tmp_path, "date,A\n" + rows(days, [["1"]] * len(days)))
+    assert "is not a date that can be read" in refusal(path)
 
 
 # Folders.

@@ -18,6 +18,7 @@ _CLOCK = r"(?:[T ]+(\d{1,2}):(\d\d)(?::(\d\d)(?:\.\d+)?)?)?"
 _ZONE = r"(?: ?(Z|UTC|[-+]\d\d:?\d\d))?"
 _YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})(?:[-/.](\d{1,2}))?" + _CLOCK + _ZONE, re.A)
 _DIGITS = re.compile(r"(\d{4})(\d\d)(\d\d)", re.A)
+_MONTH = re.compile(r"(\d{4})(0[1-9]|1[0-2])", re.A)
 _YEAR_LAST = re.compile(r"(\d{1,2})[-/.](\d{1,2})[-/.](\d{4})" + _CLOCK + _ZONE, re.A)
 _SHORT_YEAR = re.compile(r"\d{1,2}([-/.])\d{1,2}\1\d{1,2}" + _CLOCK + _ZONE, re.A)
 _TIME = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d)(?:\.\d+)?)?|(\d\d)(\d\d)(\d\d)", re.A)
@@ -65,7 +66,8 @@ def read_dates(cells: np.ndarray, *, by_day: bool = False) -> Dates:
 
     Accepts dates and times, ISO 8601 and similar texts (2020-01-31, 2020/1/31, 20200131,
     2020-01-31 16:00+01:00), 31.01.2020, and 31/01/2020 or 01/31/2020 if at least one cell of the
-    column shows which number is the day. Time zones are dropped: if all times are midnight in
+    column shows which number is the day. A column of more than a year may hold months (202001).
+    Time zones are dropped: if all times are midnight in
     their own zones, the dates are kept; otherwise times are converted to UTC. A column that holds
     only numbers may count one of ``UNITS``.
 
@@ -82,7 +84,7 @@ def read_dates(cells: np.ndarray, *, by_day: bool = False) -> Dates:
     good = np.full(len(unique) + 1, np.datetime64("NaT", "s"))
     bad: list[str | None] = [None] * len(unique) + [NO_DATE]
     unit = _unit(counts := _counts(unique))
-    moments = _of_unit(counts, unit) if unit else _of_calendar(unique, by_day)
+    moments = _of_unit(counts, unit) if unit else _of_months(counts) or _of_calendar(unique, by_day)
     for k, moment in enumerate(moments):
         if isinstance(moment, str):
             bad[k] = moment
@@ -172,6 +174,26 @@ def _seconds(count: float, unit: Unit) -> int:
     return round(seconds) if unit is _EXCEL else math.floor(seconds)
 
 
+def _of_months(counts: np.ndarray) -> list[datetime | str]:
+    """The first days of months such as 202001; empty if a column holds anything else.
+
+    It must have more rows than a year has months, and several months: 200112 may be a day of 2020.
+    """
+    known = counts[~np.isnan(counts)]
+    years, months = np.divmod(known, 100)
+    if (
+        len(known) <= 12
+        or not np.isin(years, YEARS).all()
+        or not np.isin(months, range(1, 13)).all()
+        or (months == months[0]).all()
+    ):
+        return []
+    return [
+        NO_DATE if math.isnan(count) else datetime(int(count) // 100, int(count) % 100, 1)
+        for count in counts.tolist()
+    ]
+
+
 # Text and dates.
 
 
@@ -201,6 +223,11 @@ def _of_calendar(cells: np.ndarray, by_day: bool) -> list[datetime | str]:
 def readable_date(text: str) -> bool:
     """True for text that is a date, whichever number is the day."""
     return isinstance(_moment(text, "day"), datetime) or bool(_year_last(text))
+
+
+def begins_row(text: str) -> bool:
+    """True for text that is a date or a month such as 202001, as the first cell of a row."""
+    return readable_date(text) or bool(_MONTH.fullmatch(text))
 
 
 def _year_last(cell: Any) -> re.Match[str] | None:

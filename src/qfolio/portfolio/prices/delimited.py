@@ -4,6 +4,7 @@ import csv
 import io
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -44,25 +45,32 @@ def from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set[
     if declared := _DECLARED.match(text):  # by Excel, in a line of its own
         separator, text = declared[1], "\n" + text[declared.end() :]
     lines = io.StringIO(text, newline="")
-    separator = separator or max(SEPARATORS, key=lambda mark: len(_records(lines, mark, 1)[0][0]))
-    records, blank = _records(lines, separator, LOOKED_AT)
-    header = parse_header(records)
+    opened = {mark: _records(lines, mark, LOOKED_AT) for mark in separator or SEPARATORS}
+    headers = {mark: parse_header(records) for mark, (records, _) in opened.items()}
+    widest = max(opened, key=lambda mark: len(opened[mark][0][0]))
+    separator = next((mark for mark, header in headers.items() if header.below_text), widest)
+    (records, blank), header = opened[separator], headers[separator]
     if len(header.names) < 2:
-        above = any(
-            len(record) > 1 for mark in SEPARATORS for record in _records(lines, mark, 9)[0]
-        )
+        above = any(len(record) > 1 for found, _ in opened.values() for record in found[:9])
         advice = (
             "remove the lines above the names of the columns."
             if above
             else "a table needs several, separated by commas, semicolons or tabs."
         )
         raise QfolioError(f"{quote(name)} has only one column, {quote(header.names[0])}; {advice}")
-    plain = texts(header.names)
     # pandas assumes the first row's width for all rows, and would silently cut longer ones.
     width = max(len(record) for record in (header.names, *records[header.lines :][:1]))
     layout = _Layout(header, separator, blank + header.lines, width)
+    if not header.below_text:
+        return _with_decimals(text, name, layout, texts(header.names))
+    text, left_out = _first_table(text, layout)
+    return replace(_with_decimals(text, name, layout, texts(header.names)), left_out=left_out)
+
+
+def _with_decimals(text: str, name: str, layout: "_Layout", plain: set[int]) -> Table:
+    """The table of a text, with the decimal mark that its numbers show."""
     table = _parse(text, name, layout, plain, ".")
-    unclear = None if separator == "," else _unclear_points(text)
+    unclear = None if layout.separator == "," else _unclear_points(text)
     commas, points = _decimals(table, plain)
     if commas > (0 if unclear else points):
         return _parse(text, name, layout, plain, ",")
@@ -73,6 +81,22 @@ def from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set[
             "separate the columns by commas if they mark decimals."
         )
     return table
+
+
+def _first_table(text: str, layout: "_Layout") -> tuple[str, str]:
+    """The text up to the first blank line below the header, and what is left out."""
+    kept: list[str] = []
+    rest = ""
+    for line in (lines := io.StringIO(text, newline="")):
+        blank = not line.strip(f"{layout.separator} \t\r\n")
+        if blank and len(kept) > layout.before:
+            rest = next((below.strip() for below in lines if below.strip()), "")
+            break
+        kept.append(line)
+    left_out = f"the lines above row {layout.before} are left out"
+    if rest:
+        left_out += f", and so is what follows the blank row {len(kept) + 1}: {quote(rest, 60)} …"
+    return "".join(kept), left_out
 
 
 class _Layout(NamedTuple):

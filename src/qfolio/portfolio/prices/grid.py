@@ -99,6 +99,8 @@ def check_currencies(tables: Sequence[tuple[Table, Sequence[int]]], findings: Fi
 def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
     """The grid of a table; None if it would be far too large."""
     prices = columns.prices
+    if table.left_out:
+        findings.note(table.left_out)
     check_currencies([(table, prices)], findings)
     cells = table.columns[columns.date]
     if columns.time is not None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from qfolio.portfolio.prices.cells import is_missing, is_number
-from qfolio.portfolio.prices.dates import readable_date
+from qfolio.portfolio.prices.dates import begins_row, readable_date
 from qfolio.portfolio.prices.vocabulary import (
     ASSET_NAMES,
     DATE_NAMES,
@@ -25,6 +25,7 @@ class Header(NamedTuple):
     names: tuple[str, ...]  # of the columns; two levels are joined by a space
     levels: dict[int, tuple[str, str]]  # both levels, by column, if there are two
     lines: int = 1  # number of lines in the file
+    below_text: bool = False  # whether sentences precede it, as in a report
 
 
 def name_columns(names: Iterable[Any]) -> Header:
@@ -45,10 +46,11 @@ def parse_header(records: list[list[str]]) -> Header:
 
     pandas writes columns with two levels as two lines, with the levels' names in the first column
     (Price, Close, High, … above Ticker, AAPL, AAPL, …); if the index has a name, it stands alone
-    on a third line. Bloomberg's exports have settings above, and then tickers above fields.
+    on a third line. Bloomberg's exports have settings above, and then tickers above fields; Kenneth
+    French's tables have sentences above.
     """
     records = [[cell.strip() for cell in record] or [""] for record in records]
-    if header := _below_settings(records):
+    if header := _below_settings(records) or _below_text(records):
         return header
     first, second, third = (*records, [], [])[:3]
     pairs: list[Any] = list(first)
@@ -97,6 +99,24 @@ def _below_settings(records: list[list[str]]) -> Header | None:
             names[j] = (ticker, names[j]) if names[j] else ""
     names[0] = names[0] or "date"
     return name_columns(names)._replace(lines=k + 1)
+
+
+def _below_text(records: list[list[str]]) -> Header | None:
+    """The header below lines of text; None if the first record may be the header.
+
+    It has as many cells as the first row below, and another number than the line above.
+    """
+    triples = zip(records, records[1:], records[2:], strict=False)
+    for lines, (above, record, below) in enumerate(triples, 2):
+        if (
+            len(above) != len(record) == len(below) > 1
+            and not any(map(_is_value, record))
+            and begins_row(below[0])
+            and any(is_number(cell) or is_number(cell, ",") for cell in below[1:])
+        ):
+            names = record[0] or "date", *record[1:]
+            return name_columns(names)._replace(lines=lines, below_text=True)
+    return None
 
 
 def _setting(record: list[str]) -> str:

@@ -23,6 +23,7 @@ class Table:
     decimal: the decimal mark.
     levels: both levels of the header, by column, if there are two.
     turned: whether rows and columns were exchanged; users still see the file or frame as it is.
+    left_out: what of the file is not in the table, for a note.
     """
 
     names: tuple[str, ...]
@@ -32,6 +33,7 @@ class Table:
     decimal: str = "."
     levels: dict[int, tuple[str, str]] = field(default_factory=dict)
     turned: bool = False
+    left_out: str = ""
 
     def spot(self, line: int, j: int) -> dict[str, Any]:
         """Row and column of a cell as users see them."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from qfolio.core.text import amount
 from qfolio.portfolio.prices.findings import Findings
 from qfolio.portfolio.prices.grid import Grid, report_cells
 
@@ -15,6 +16,8 @@ RUIN = (
     "Keep an asset that lost everything: empty its cells from there on and choose ended='cash-out' "
     "with a delisting_haircut (--ended, --delisting-haircut)."
 )
+UNKNOWN = {"percent": (-99.99, -999.0), "fraction": ()}
+"""Numbers that Kenneth French's tables have where a return is missing."""
 SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
 
 
@@ -27,6 +30,12 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
     if not grid.prices.values.size:
         return grid
     block = replace(grid.prices, name="return")
+    if (unknown := np.isin(block.values, UNKNOWN[unit])).any():
+        findings.note(
+            f"{amount(int(unknown.sum()), 'return')} of −99.99 or −999 percent, which mark missing "
+            "ones in Kenneth French's tables, are not read"
+        )
+        block = replace(block, values=np.where(unknown, np.nan, block.values))
     with np.errstate(over="ignore", under="ignore"):
         rates = block.values * UNITS[unit]
         known = np.isfinite(rates)
