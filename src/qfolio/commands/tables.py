@@ -29,7 +29,8 @@ EndedAsBefore = Annotated[
     ),
 ]
 Returns = Annotated[
-    Literal["percent", "fraction"] | None, arg(metavar="percent|fraction", help_behavior_hint="")
+    Literal["percent", "fraction", "relative"] | None,
+    arg(metavar="percent|fraction|relative", help_behavior_hint=""),
 ]
 
 
@@ -48,8 +49,9 @@ class Reading:
         features: Columns that hold features for agents instead of prices.
         columns: Columns that hold a number for the whole market, such as a cash rate, which costs
             may use and agents do not see; NAME=FILE reads one from a file of dates and numbers.
-        returns: Unit of the table's numbers, if they are returns over the row before; they are
-            cumulated to prices that start at 100 (default: they are prices).
+        returns: Unit of the table's numbers, if they are returns over the row before, or relatives
+            to it (new price over old); they are cumulated to prices that start at 100 (default:
+            they are prices).
         date: Column of dates (default: found by its name).
     """
 

@@ -107,8 +107,31 @@ def test_a_unit_that_is_unlikely():
     )  # fmt: skip
     with pytest.raises(QfolioError, match="−100% or less"):
         load(100 * rates, returns="fraction")
-    with pytest.raises(QfolioError, match="returns is 'log'; choose from percent, fraction"):
+    with pytest.raises(QfolioError, match="choose from percent, fraction, relative"):
         load(rates, returns="log")
+
+
+def test_relatives_are_told_from_prices():
+    """As prices they would revert to 1, and be bought below it at a profit."""
+    table = prices()
+    relatives = table / table.shift(1)
+    (error,) = findings(relatives.iloc[1:], "error")
+    assert error.message.startswith("the numbers look like price relatives, new price over old")
+    assert error.advice == "Give prices, or choose returns='relative' (--returns)."
+    back = load(relatives, returns="relative")
+    np.testing.assert_allclose(back.values, 100 * table / table.iloc[0], rtol=1e-12)
+    with pytest.raises(QfolioError, match="−100% or less"):
+        load(relatives.mask(relatives == relatives.iloc[5, 1], 0.0), returns="relative")
+    (warning, *_) = findings(1 + 40 * (relatives - 1), "warning", returns="relative")
+    assert "taken as relative" in warning.message
+
+
+def test_prices_near_one_are_prices():
+    """Exchange rates wander across 1 rarely, and dollars on a blockchain stay at it."""
+    rng, days = np.random.default_rng(3), prices().index
+    rates = np.exp(rng.normal(0, 0.005, (len(days), 3)).cumsum(axis=0))
+    for values in (rates, 1 + rng.normal(0, 3e-4, (len(days), 3))):
+        assert not findings(pd.DataFrame(values, days, list("ABC")), "error")
 
 
 def test_returns_are_told_from_prices():

@@ -8,7 +8,7 @@ from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.frequency import every_day, spacing
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Block, Grid, report_cells
-from qfolio.portfolio.prices.returns import RUIN, look_like_returns
+from qfolio.portfolio.prices.returns import RUIN, look_like_relatives, look_like_returns
 from qfolio.portfolio.prices.vocabulary import is_cash
 
 FEWEST_ROWS, FEW_ROWS = 3, 60
@@ -53,6 +53,13 @@ def check_cells(grid: Grid, findings: Findings) -> None:
             f"the numbers look like returns: {(values < 0).sum() / np.isfinite(values).sum():.0%} "
             "are negative",
             advice="Give prices, or choose returns='percent' or 'fraction' (--returns).",
+        )
+        return
+    if look_like_relatives(values):
+        findings.error(
+            "the numbers look like price relatives, new price over old: they are near 1, and as "
+            "often above as below",
+            advice="Give prices, or choose returns='relative' (--returns).",
         )
         return
     report_cells(

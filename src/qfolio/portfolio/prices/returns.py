@@ -9,16 +9,19 @@ from qfolio.portfolio.prices.findings import Findings
 from qfolio.portfolio.prices.grid import Grid, report_cells
 
 START = 100.0
-UNITS = {"percent": 0.01, "fraction": 1.0}
-USUAL = {"percent": (0.02, np.inf), "fraction": (0.0, 0.2)}
+UNITS = {"percent": (0.0, 0.01), "fraction": (0.0, 1.0), "relative": (1.0, 1.0)}
+"""The number of a return of nothing, and what one more is; a relative is new price over old."""
+USUAL = {"percent": (0.02, np.inf), "fraction": (0.0, 0.2), "relative": (0.0, 0.2)}
 """The range of a usual return, in its unit: from a bar of minutes to a year."""
 RUIN = (
     "Keep an asset that lost everything: empty its cells from there on and choose ended='cash-out' "
     "with a delisting_haircut (--ended, --delisting-haircut)."
 )
-UNKNOWN = {"percent": (-99.99, -999.0), "fraction": ()}
+UNKNOWN = {"percent": (-99.99, -999.0)}
 """Numbers that Kenneth French's tables have where a return is missing."""
 SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
+RELATIVE = (0.001, 0.2)  # how far the usual relative is from 1; a price of one dollar is closer
+CHOICES = "'percent', 'fraction' or 'relative'"
 
 
 def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
@@ -29,20 +32,20 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
     """
     if not grid.prices.values.size:
         return grid
-    block = replace(grid.prices, name="return")
-    if (unknown := np.isin(block.values, UNKNOWN[unit])).any():
+    block, (zero, one) = replace(grid.prices, name="return"), UNITS[unit]
+    if (unknown := np.isin(block.values, UNKNOWN.get(unit, ()))).any():
         findings.note(
             f"{amount(int(unknown.sum()), 'return')} of −99.99 or −999 percent, which mark missing "
             "ones in Kenneth French's tables, are not read"
         )
         block = replace(block, values=np.where(unknown, np.nan, block.values))
     with np.errstate(over="ignore", under="ignore"):
-        rates = block.values * UNITS[unit]
+        rates = (block.values - zero) * one
         known = np.isfinite(rates)
         report_cells(grid, block, np.isinf(rates), "is infinite", "Correct the cell.", findings)
         report_cells(
             grid, block, known & (rates <= -1), "is −100% or less",
-            f"Check the unit, returns='percent' or 'fraction' (--returns). {RUIN}", findings,
+            f"Check the unit, returns={CHOICES} (--returns). {RUIN}", findings,
         )  # fmt: skip
         growth = np.cumprod(1 + np.where(known & (rates > -1), rates, 0.0), axis=0)
         present = ~np.isnan(rates) | block.wrong
@@ -59,7 +62,7 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
         )
     else:
         findings.note(f"prices are cumulated from returns and start at {START:g}")
-    sizes = np.abs(block.values[known & (block.values != 0)])
+    sizes = np.abs(rates[known & (rates != 0)]) / one
     low, high = USUAL[unit]
     if sizes.size and not low <= (usual := float(np.median(sizes))) <= high:
         other = "fraction" if unit == "percent" else "percent"
@@ -68,6 +71,17 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
             advice=f"Check the unit: perhaps it is {other}.",
         )
     return replace(grid, prices=replace(block, values=values, name="price"))
+
+
+def look_like_relatives(values: np.ndarray) -> bool:
+    """Whether numbers of shape (rows, assets) are near 1 and cross it every few rows."""
+    known = values[np.isfinite(values)]
+    low, high = RELATIVE
+    if not known.size or (known <= 0).any() or not low <= np.median(abs(known - 1)) <= high:
+        return False
+    both = np.isfinite(values[1:]) & np.isfinite(values[:-1])
+    crossed = (values[1:] < 1) != (values[:-1] < 1)
+    return bool(both.any() and crossed[both].mean() >= SIGNED[0])
 
 
 def look_like_returns(values: np.ndarray) -> bool:

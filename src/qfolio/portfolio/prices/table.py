@@ -296,8 +296,9 @@ def load(
         columns: Columns that hold one number for the whole market, such as a cash rate; agents do
             not see them. "NAME=FILE" reads one from a file with a column of dates and one of
             numbers, each of which holds until the next.
-        returns: "percent" or "fraction" if the table holds simple returns from the row before;
-            they are cumulated to prices that start at 100 (default: it holds prices).
+        returns: "percent" or "fraction" if the table holds simple returns from the row before,
+            "relative" if it holds new price over old; they are cumulated to prices that start at
+            100 (default: it holds prices).
         date: Column of dates (default: found by its name).
 
     Raises:
