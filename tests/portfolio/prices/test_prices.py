@@ -137,6 +137,19 @@ def test_the_day_may_stand_first_where_the_column_shows_it(tmp_path: Path, patte
     assert "no other row shows which number is the day" in found[0].message
 
 
+@pytest.mark.parametrize(
+    "pattern", ["%d-%b-%Y", "%d %B %Y", "%b %d, %Y", "%B %d %Y", "%d-%b-%Y 16:30"]
+)
+def test_months_may_have_names(tmp_path: Path, pattern: str):
+    days = pd.date_range("2020-01-10", periods=12, freq="MS")
+    text = "date;A\n" + "".join(f"{day.strftime(pattern)};{k + 1}\n" for k, day in enumerate(days))
+    read = load(csv(tmp_path, text.upper())).dates.astype("datetime64[D]")
+    np.testing.assert_array_equal(read, days.to_numpy("datetime64[D]"))
+    for wrong in ("01-Foo-2020", "Ja 02, 2020", "31-Feb-2020", "1-Mayday-2020"):
+        (found,) = errors(csv(tmp_path, text.replace(days[3].strftime(pattern), wrong)))
+        assert found.row == 5
+
+
 def test_zones_name_a_day_or_become_utc():
     zoned = frame()
     zoned.index = zoned.index.tz_localize("Asia/Tokyo")
@@ -282,6 +295,7 @@ def test_rows_of_a_data_frame_are_counted_from_zero():
         (wide(A4="1,2"), "row 4: there are 4 fields, but 3 column names"),
         (wide(A2="1,2"), "row 2: there are 4 fields, but 3 column names"),
         (wide().split("\n", 1)[1], "row 1: the first line holds values instead of column names"),
+        ("1577836800000,7.1,7.2,7,7.1\n" * 3, "row 1: the first line holds values instead of"),
         (wide(A1="open", B1="high").replace("\n", ",1,1,1\n").replace("1,1,1", "low,close,v", 1),
          "'open', 'high', 'low', 'close' are columns of one asset, but there is also 'v'"),
         ("ticker,px\nA,1\nA,2\nA,3\n", "there is no column of dates"),

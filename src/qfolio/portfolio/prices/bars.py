@@ -114,7 +114,7 @@ def _of_levels(table: Table, columns: Sequence[int], findings: Findings) -> dict
 def _of_one_asset(table: Table, columns: Sequence[int], findings: Findings) -> dict[str, list[Bar]]:
     """The bars of a table of one asset; none if the columns are prices of several."""
     bars = [Bar(table.names[j], j) for j in columns if kind(table.names[j])]
-    closes = [bar for bar in bars if plain(bar.kind) in ("close", *ADJUSTED_NAMES)]
+    closes = [bar for bar in bars if plain(bar.kind) in ("close", "price", *ADJUSTED_NAMES)]
     prices = [bar for bar in bars if is_price(bar.kind)]
     kinds = {kind(bar.kind) for bar in bars}
     # Low, Open and Last are names of assets, too: without a close, it takes more of them.

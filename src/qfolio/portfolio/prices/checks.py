@@ -20,6 +20,7 @@ from qfolio.portfolio.prices.plausibility import FEWEST_ROWS, check_cells, check
 from qfolio.portfolio.prices.rates import check_rates
 from qfolio.portfolio.prices.returns import UNITS, cumulate
 from qfolio.portfolio.prices.stale import check_stale
+from qfolio.portfolio.prices.unnamed_bars import check_unnamed_bars
 
 MISSING = ("error", "drop-asset", "forward-fill")
 LATE = ("error", "drop-asset", "trim", "join")
@@ -102,6 +103,7 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], Findings]:
     rest = complete(grid, choices.missing, choices.late, findings, delists=delists)
     if not len(rest.assets):
         return {}, findings
+    check_unnamed_bars(grid, rest, findings)
     check_moves(grid, rest, findings)
     check_stale(grid, rest, findings, check_rates(grid, rest, findings))
     check_duplicates(grid, rest, findings)

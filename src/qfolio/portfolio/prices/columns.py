@@ -129,6 +129,12 @@ def _check_names(
     """The columns that matter: all but those that have neither a name nor content."""
     names = table.names
     columns = [j for j, name in enumerate(names) if name or not _is_blank(table.columns[j])]
+    if table.first_row and (readable_date(names[0]) or all(map(is_number, names))):
+        findings.error(
+            "the first line holds values instead of column names", row=table.first_row - 1,
+            advice="Put a line of names on top, such as date,AAPL,MSFT.",
+        )  # fmt: skip
+        return columns
     places: dict[str, list[int]] = {}
     for j in columns:
         places.setdefault(names[j], []).append(j)
@@ -142,11 +148,6 @@ def _check_names(
             findings.error(
                 f"the columns {listed}{more} have the same name", column=name, advice=advice
             )
-    if table.first_row and not findings.bad and readable_date(names[0]):
-        findings.error(
-            "the first line holds values instead of column names", row=table.first_row - 1,
-            advice="Put a line of names on top, such as date,AAPL,MSFT.",
-        )  # fmt: skip
     wanted = features + shared
     for name in dict.fromkeys((*wanted, *([] if date is None else [date]))):
         if name not in places and not columns_of_kind(table, name):

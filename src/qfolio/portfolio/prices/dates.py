@@ -20,7 +20,17 @@ _YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})(?:[-/.](\d{1,2}))?" + _CLOCK + 
 _DIGITS = re.compile(r"(\d{4})(\d\d)(\d\d)", re.A)
 _MONTH = re.compile(r"(\d{4})(0[1-9]|1[0-2])", re.A)
 _YEAR_LAST = re.compile(r"(\d{1,2})[-/.](\d{1,2})[-/.](\d{4})" + _CLOCK + _ZONE, re.A)
+_NAMED = re.compile(
+    r"(?:(\d{1,2})[ -]([A-Z]{3,9})\.?[ -](\d{4})|([A-Z]{3,9})\.? (\d{1,2}),? (\d{4}))"
+    + _CLOCK
+    + _ZONE,
+    re.A | re.I,
+)
 _SHORT_YEAR = re.compile(r"\d{1,2}([-/.])\d{1,2}\1\d{1,2}" + _CLOCK + _ZONE, re.A)
+_MONTHS = (
+    "january", "february", "march", "april", "may", "june", "july", "august", "september",
+    "october", "november", "december",
+)  # fmt: skip
 _TIME = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d)(?:\.\d+)?)?|(\d\d)(\d\d)(\d\d)", re.A)
 _COUNT = re.compile(r"-?\d+(\.\d+)?", re.A)
 
@@ -65,11 +75,11 @@ def read_dates(cells: np.ndarray, *, by_day: bool = False) -> Dates:
     """A column of cells as dates.
 
     Accepts dates and times, ISO 8601 and similar texts (2020-01-31, 2020/1/31, 20200131,
-    2020-01-31 16:00+01:00), 31.01.2020, and 31/01/2020 or 01/31/2020 if at least one cell of the
-    column shows which number is the day. A column of more than a year may hold months (202001).
-    Time zones are dropped: if all times are midnight in
-    their own zones, the dates are kept; otherwise times are converted to UTC. A column that holds
-    only numbers may count one of ``UNITS``.
+    2020-01-31 16:00+01:00), 31-Jan-2020, Jan 31, 2020 and 31.01.2020, and 31/01/2020 or 01/31/2020
+    if at least one cell of the column shows which number is the day. A column of more than a year
+    may hold months (202001). Time zones are dropped: if all times are midnight in their own zones,
+    the dates are kept; otherwise times are converted to UTC. A column that holds only numbers may
+    count one of ``UNITS``.
 
     by_day: whether dates are also kept if each is of another day in its zone. Only for prices:
     what is known beside several prices a day must not be dated earlier than it was known.
@@ -270,6 +280,13 @@ def _read_moment(cell: Any, order: str | None) -> datetime | str | None:
             return f"in {quote(text)} no other row shows which number is the day"
         if order == "month":
             day, month = month, day
+    elif match := _NAMED.fullmatch(text):
+        *either, hour, minute, second, zone = match.groups()
+        day, name, year = either[:3] if either[0] else (either[4], either[3], either[5])
+        named = [k for k, month in enumerate(_MONTHS, 1) if month.startswith(name.lower())]
+        if len(named) != 1:
+            return None
+        month, clock = named[0], [hour, minute, second, zone]
     else:
         return None
     hour, minute, second, zone = clock

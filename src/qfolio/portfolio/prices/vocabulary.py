@@ -2,7 +2,7 @@
 
 import re
 
-DATE_NAMES = ("date", "dates", "datetime", "timestamp", "time")
+DATE_NAMES = ("date", "dates", "datetime", "timestamp", "time", "open time", "window start")
 ASSET_NAMES = ("asset", "ticker", "tic", "symbol", "name", "instrument")
 SHARES_NAMES = ("shares", "quantity", "qty", "units", "position")
 CASH = "cash"
@@ -29,7 +29,7 @@ KINDS = {
     "open": ("open", "px open"),
     "high": ("high", "px high"),
     "low": ("low", "px low"),
-    "volume": ("volume", "vol", "px volume"),
+    "volume": ("volume", "vol", "px volume", "total volume"),
     "other": (
         "adj open", "adj high", "adj low", "adj volume", "adjopen", "adjhigh", "adjlow",
         "adjvolume", "vwap", "trades", "transactions", "trade count", "number of trades",
