@@ -267,6 +267,8 @@ def _check_wide(table: Table, columns: list[int], when: int, findings: Findings)
 
 def _holds_words(cells: np.ndarray) -> bool:
     """Whether a column has cells, and none is a number with either decimal mark."""
+    if cells.dtype.kind == "f":
+        return False
     known = [cell for cell in cells.tolist() if not is_missing(cell)]
     words = (
         isinstance(cell, str) and not is_number(cell) and not is_number(cell, ",") for cell in known
