@@ -19,9 +19,10 @@ from qfolio.portfolio import policy as module
 from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.policy import Policy, train
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
 
 from listeners import Tell
-from tables import featured_table
+from tables import featured_table, price_table, random_walk
 
 ROWS, WINDOW = 80, 5
 AGENTS: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -269,6 +270,15 @@ def test_programs_that_are_used_again_learn_the_same():
     assert not same(used[0].learner, used[1].learner)
     population.programs_of.cache_clear()
     assert same(learned("pathwise", agent=fast).learner, used[1].learner)
+
+
+def test_a_mandate_that_cannot_be_met_is_refused_by_the_task():
+    """So by everything that makes one: policies, the estimator and the Gymnasium environment."""
+    mandate = {"assets": {"cap": 0.1}, "cash": {"max": 0.1}}
+    prices = price_table(random_walk(120))
+    with pytest.raises(QfolioError, match=r"caps of assets .* and cash of at most 10% clash"):
+        Portfolio.of(prices, mandate=mandate)
+    assert Portfolio.of(prices, mandate={**mandate, "cash": {"max": 0.7}}).mandate
 
 
 def test_a_mandate_may_be_a_dictionary():

@@ -104,11 +104,17 @@ class Portfolio(Market):
 
     @staticmethod
     def of(prices: Prices, **settings: Any) -> "Portfolio":
-        """A task on all rows of a table; mandate: anything that ``limits.mandate_text`` takes."""
+        """A task on all rows of a table.
+
+        mandate: anything that ``limits.mandate_text`` takes. Raises QfolioError if it cannot be
+        met.
+        """
         require_type("prices", prices, Prices, "a table that qfolio.load_prices has read")
         if "mandate" in settings:
             settings["mandate"] = mandate_text(settings["mandate"], prices.assets)
         task = Portfolio.blank(len(prices.assets), len(prices.feature_names), **settings)
+        if task.mandate:
+            checks.require(task.mandate, np.ones(len(prices.assets), bool), task.max_weight)
         return task.on_rows(prices)
 
     @staticmethod

@@ -326,6 +326,14 @@ def test_a_table_does_not_grow_beyond_its_index(every, rows):
     assert len(ahead.extended(table()).dates) == ROWS - 100
 
 
+@pytest.mark.parametrize(("every", "said"), [(1, False), (2, True), (5, True)])
+def test_an_index_that_often_stands_still_is_named(every, said):
+    """Its returns then come in lumps, and have little in common with those of the rows."""
+    level = pd.DataFrame({"date": DAYS, "level": table().values.mean(1)})
+    _, notes = placed(level.iloc[::every])
+    assert any("and stands still on the others" in note for note in notes) == said
+
+
 def test_a_return_on_a_day_between_rows_is_refused():
     prices = table(every=7)
     dates = [*prices.dates.astype("datetime64[D]").astype(str), "2022-03-31"]

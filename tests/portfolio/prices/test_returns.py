@@ -126,6 +126,17 @@ def test_relatives_are_told_from_prices():
     assert "taken as relative" in warning.message
 
 
+@pytest.mark.parametrize("level", [1.0, 100.0])
+def test_prices_are_told_from_returns(level: float):
+    table = prices() / prices().iloc[0] * level
+    for unit in ("percent", "fraction", *(["relative"] if level > 1 else [])):
+        (error,) = findings(table, "error", returns=unit)
+        assert error.message.startswith("the numbers look like prices, not returns: none is a loss")
+        assert error.advice == "If they are prices, leave out returns (--returns)."
+    rising = abs(table.pct_change()).iloc[1:]  # of funds that are valued smoothly
+    assert not findings(10 * rising, "error", returns="percent")
+
+
 def test_prices_near_one_are_prices():
     """Exchange rates wander across 1 rarely, and dollars on a blockchain stay at it."""
     rng, days = np.random.default_rng(3), prices().index

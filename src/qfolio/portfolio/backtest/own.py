@@ -31,6 +31,8 @@ PERCENT = 100.0
 
 OLDEST = np.timedelta64(7, "D")
 """How long a level is carried forward to later rows, which bridges holidays of other exchanges."""
+OFTEN = 0.8
+"""The share of rows with a new level below which a note says that there are few of them."""
 
 Dates = NDArray[np.datetime64]
 Rows = NDArray[np.intp]
@@ -98,14 +100,18 @@ def place(name: str, own: Own, prices: Prices, days: slice, task: Portfolio, cap
         return _placed_weights(name, own, prices, days, task, cap, none)
     lag = int(task.lag)
     earned = slice(days.start + lag + 1, days.stop + lag + 1)
-    returns = (_returns if own.kind == "returns" else _growth)(name, own, prices, earned)
+    notes: tuple[str, ...] = ()
+    if own.kind == "returns":
+        returns = _returns(name, own, prices, earned)
+    else:
+        returns, notes = _growth(name, own, prices, earned)
     if not (np.isfinite(returns) & (returns >= -1)).all():
         worst = int(np.argmin(np.where(np.isfinite(returns), returns, -np.inf)))
         raise QfolioError(
             f"{name} returns {returns[worst]:g} on {_day(prices, earned.start + worst)}; returns "
             "are fractions, at least −1 (0.012 for 1.2%)."
         )
-    return Placed(none, returns, ())
+    return Placed(none, returns, notes)
 
 
 def _placed_weights(
@@ -280,8 +286,8 @@ def _returns(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
     return found
 
 
-def _growth(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
-    """Returns on the days of the test, from the last levels that were known at each row."""
+def _growth(name: str, own: Own, prices: Prices, earned: slice) -> tuple[Floats, tuple[str, ...]]:
+    """Returns on the days of the test, from the last levels known at each row, and notes."""
     first = earned.start - 1
     latest, old = _levels(own, prices.dates[first : earned.stop])
     if old.any():
@@ -290,8 +296,14 @@ def _growth(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
             f"before; it needs levels from {_day(prices, first)} to "
             f"{_day(prices, earned.stop - 1)}."
         )
-    levels = own.values[latest]
-    return np.asarray(levels[1:] / levels[:-1] - 1)
+    levels, rows = own.values[latest], len(latest) - 1
+    fresh = int((np.diff(latest) > 0).sum())
+    notes = (
+        f"{name} has a new level on only {fresh:,} of {rows:,} rows of the test, and stands still "
+        "on the others, so figures that compare row by row, such as beta and tracking error, say "
+        "little: give its levels at every row.",
+    )
+    return np.asarray(levels[1:] / levels[:-1] - 1), notes if fresh < OFTEN * rows else ()
 
 
 def require_levels(name: str, own: Own, prices: Prices) -> None:

@@ -20,6 +20,7 @@ RUIN = (
 UNKNOWN = {"percent": (-99.99, -999.0)}
 """Numbers that Kenneth French's tables have where a return is missing."""
 SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
+FEWEST, GAIN = 20, 0.008  # returns without a loss, and their usual size, that are no returns
 RELATIVE = (0.001, 0.2)  # how far the usual relative is from 1; a price of one dollar is closer
 CHOICES = "'percent', 'fraction' or 'relative'"
 
@@ -42,6 +43,14 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
     with np.errstate(over="ignore", under="ignore"):
         rates = (block.values - zero) * one
         known = np.isfinite(rates)
+        moved = rates[known & (rates != 0)]
+        if len(moved) >= FEWEST and (moved > 0).all() and np.median(moved) >= GAIN:
+            findings.error(
+                "the numbers look like prices, not returns: none is a loss, and the usual one "
+                f"would be a gain of {np.median(moved):.2g} times the wealth",
+                advice="If they are prices, leave out returns (--returns).",
+            )
+            return grid
         report_cells(grid, block, np.isinf(rates), "is infinite", "Correct the cell.", findings)
         report_cells(
             grid, block, known & (rates <= -1), "is −100% or less",
@@ -62,7 +71,7 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
         )
     else:
         findings.note(f"prices are cumulated from returns and start at {START:g}")
-    sizes = np.abs(rates[known & (rates != 0)]) / one
+    sizes = np.abs(moved) / one
     low, high = USUAL[unit]
     if sizes.size and not low <= (usual := float(np.median(sizes))) <= high:
         other = "fraction" if unit == "percent" else "percent"
