@@ -141,8 +141,8 @@ def test_prices_near_one_are_prices():
     """Exchange rates wander across 1 rarely, and dollars on a blockchain stay at it."""
     rng, days = np.random.default_rng(3), prices().index
     rates = np.exp(rng.normal(0, 0.005, (len(days), 3)).cumsum(axis=0))
-    for values in (rates, 1 + rng.normal(0, 3e-4, (len(days), 3))):
-        assert not findings(pd.DataFrame(values, days, list("ABC")), "error")
+    for values in (rates, rates[:15], 1 + rng.normal(0, 3e-4, (len(days), 3))):
+        assert not findings(pd.DataFrame(values, days[: len(values)], list("ABC")), "error")
 
 
 def test_returns_are_told_from_prices():

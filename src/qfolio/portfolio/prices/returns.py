@@ -20,7 +20,8 @@ RUIN = (
 UNKNOWN = {"percent": (-99.99, -999.0)}
 """Numbers that Kenneth French's tables have where a return is missing."""
 SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
-FEWEST, GAIN = 20, 0.008  # returns without a loss, and their usual size, that are no returns
+FEWEST = 20  # rows, or numbers, that tell what they are
+GAIN = 0.008  # usual size of a return from which some must be losses
 RELATIVE = (0.001, 0.2)  # how far the usual relative is from 1; a price of one dollar is closer
 CHOICES = "'percent', 'fraction' or 'relative'"
 
@@ -83,10 +84,18 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
 
 
 def look_like_relatives(values: np.ndarray) -> bool:
-    """Whether numbers of shape (rows, assets) are near 1 and cross it every few rows."""
+    """Whether numbers of shape (rows, assets) are near 1 and cross it every few rows.
+
+    So do the first rows of prices that start at 1, and therefore a few rows tell nothing.
+    """
     known = values[np.isfinite(values)]
     low, high = RELATIVE
-    if not known.size or (known <= 0).any() or not low <= np.median(abs(known - 1)) <= high:
+    if (
+        len(values) < FEWEST
+        or not known.size
+        or (known <= 0).any()
+        or not low <= np.median(abs(known - 1)) <= high
+    ):
         return False
     both = np.isfinite(values[1:]) & np.isfinite(values[:-1])
     crossed = (values[1:] < 1) != (values[:-1] < 1)
