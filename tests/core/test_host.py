@@ -172,7 +172,8 @@ class Faulty(Tiny):
                 return seen, reward, False, {}
             seen = {"NaN": seen * np.nan, "longer": np.ones(3), "number": 1.0}.get(self.fault, seen)
             rewards: dict[str, Any] = {
-                "no reward": np.nan, "rewards": np.ones(1), "huge": 1e300, "none": None
+                "no reward": np.nan, "rewards": np.ones(1), "huge": 1e300, "none": None,
+                "text": "much",
             }  # fmt: skip
             reward = rewards.get(self.fault, reward)
         return seen, reward, False, False, {}
@@ -466,6 +467,7 @@ def test_it_says_what_is_wrong(make, message):
         ("no reward", "step 2 of an episode: its reward is not finite"),
         ("huge", "step 2 of an episode: its reward is not finite in single precision"),
         ("none", "step 2 of an episode: its reward is None, which is no number"),
+        ("text", "step 2 of an episode: its reward is the text 'much', which is no number"),
         ("rewards", r"step 2 of an episode: its reward has the shape \(1,\); it must be one num"),
         ("starts with NaN", "the start of an episode: its observation is not finite"),
         ("longer", r"step 2 .* has the shape \(3,\) and its observation space \(2,\)"),

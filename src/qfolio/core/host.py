@@ -193,6 +193,8 @@ def _require_number(paid: Any) -> None:
         raise QfolioError("its reward is None, which is no number")
     if np.shape(paid):
         raise QfolioError(f"its reward has the shape {np.shape(paid)}; it must be one number")
+    if isinstance(paid, str | bytes):
+        raise QfolioError(f"its reward is the text {paid!r}, which is no number")
 
 
 def _close(environments: Iterable[Any]) -> None:

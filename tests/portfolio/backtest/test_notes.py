@@ -37,6 +37,20 @@ def test_a_table_without_such_columns():
     assert notes.unread(run.replay) == []
 
 
+@pytest.mark.parametrize(
+    ("rate", "said"), [("0.05", None), ("-0.01", None), ("0.3", "30%"), ("column:rate", "30%")]
+)
+def test_a_rate_that_may_be_in_percent(rate: str, said: str | None):
+    prices = price_table(random_walk(160), market=15 * RATES, market_names=("rate", "fee"))
+    run = Backtest.create(
+        prices, {"pathwise": PATHWISE}, train="80d", test="40d", baselines=[],
+        cost_model=f"itemized(cash_rate={rate})",
+    )  # fmt: skip
+    assert [note[:17] for note in notes.generous(run.replay)] == [f"Cash earns {said} a "] * bool(
+        said
+    )
+
+
 @pytest.mark.parametrize(("days", "said"), [(1, True), (30, False)])
 def test_figures_a_year_of_a_short_test(days: int, said: bool):
     start = np.datetime64("2000-01-31")

@@ -465,7 +465,7 @@ def test_episodes_are_shorter_where_a_fold_is_short(tmp_path):
 def test_a_signal_that_no_training_row_has_is_named():
     agents = changed("pathwise", signals="momentum:5,momentum:150")
     run = create(train="100d", test="100d", agents=agents, seeds=1)
-    assert notes.unknown(run.tasks, run.folds) == [
+    assert notes.unknown(run.config.agents, run.replay) == [
         "momentum:150 looks back on more rows than 1 of 2 folds has for training; there it is "
         "unknown and counts as 0."
     ]

@@ -193,8 +193,9 @@ def test_holdings_that_differ_are_named_with_their_date_and_asset():
     assert difference.money == pytest.approx(350)
     assert difference.unfilled is None
     assert told(found, records) == (
-        "Holdings differed from those expected 1 time, by +50.00 in all (deposits, other fills), "
-        "last on 2024-01-16, most in cash (+350.00); this is not counted as a return."
+        "Holdings differed from those expected 1 time, by +50.00 in all (deposits, other fills); "
+        "this is not counted as a return. The last time, on 2024-01-16, cash differed most, by "
+        "+350.00."
     )
     exact = mark(records, prices, Proportional(0.0), lag=0)
     assert exact.differences == []

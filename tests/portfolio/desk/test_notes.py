@@ -66,6 +66,12 @@ def account(shares, trades, number):
     )  # fmt: skip
 
 
+def holding(shares, cash):
+    """An allocation from these shares of A and B, and cash."""
+    prices = Prices(DAYS[:1], ("A", "B"), np.ones((1, 2)))
+    return Allocation.of(Fixed([1, 0, 0], Proportional(0.0)), prices, np.array(shares, float), cash)
+
+
 @pytest.mark.parametrize(
     ("shares", "number"),
     [([0, 0], 1), ([5, 0], 2), ([5, 3], None), ([0, 8], 3), ([4, 4], None)],
@@ -76,15 +82,15 @@ def test_holdings_from_before_any_earlier_orders_are_noticed(shares, number):
         account([0, 0], [5, 0], 1), account([5, 0], [0, 3], 2), account([0, 8], [5, -5], 3),
         account([5, 3], [0, 0], 4),
     ]  # fmt: skip
-    now = Allocation.of(
-        Fixed([1, 0, 0], Proportional(0.0)),
-        Prices(DAYS[:1], ("A", "B"), np.ones((1, 2))),
-        np.array(shares, float),
-        1.0,
-    )
-    said = " ".join(not_traded(now, earlier))
+    said = " ".join(not_traded(holding(shares, 9.0), earlier))
     assert (f"those of record {number} before its trades" in said) == (number is not None)
     assert bool(said) == (number is not None)
+
+
+@pytest.mark.parametrize(("cash", "said"), [(9.0, True), (9.01, True), (4.0, False), (18.0, False)])
+def test_other_cash_alone_is_another_account(cash, said):
+    found = not_traded(holding([0, 0], cash), [account([0, 0], [5, 0], 1)])
+    assert bool(found) == said
 
 
 @pytest.mark.parametrize(

@@ -150,6 +150,14 @@ def test_months_may_have_names(tmp_path: Path, pattern: str):
         assert found.row == 5
 
 
+def test_an_hour_that_comes_twice_may_be_that_of_a_clock(tmp_path: Path):
+    hours = ["2023-10-29 01:00", "2023-10-29 02:00", "2023-10-29 02:00", "2023-10-29 03:00"]
+    (found,) = errors(csv(tmp_path, "date,A\n" + "".join(f"{hour},1\n" for hour in hours)))
+    assert "write times in UTC if the clocks were set back" in found.advice
+    (found,) = errors(csv(tmp_path, "date,A\n" + "".join(f"2023-10-{d},1\n" for d in (1, 2, 2, 3))))
+    assert found.advice == "Remove one of the two rows."
+
+
 def test_zones_name_a_day_or_become_utc():
     zoned = frame()
     zoned.index = zoned.index.tz_localize("Asia/Tokyo")

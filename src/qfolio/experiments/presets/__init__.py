@@ -58,7 +58,8 @@ def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
     for argument, value in {"name": name, "task": task, "agent": agent}.items():
         require_type(argument, value, str, "text")
     if ":" not in agent and agent not in AGENTS:  # others are a user's own
-        raise QfolioError(f"there is no agent {agent!r}; {near(agent, AGENTS)}")
+        suited = [other for name, other in PRESETS if name == task] or AGENTS
+        raise QfolioError(f"there is no agent {agent!r}; {near(agent, suited)}")
     presets = presets_of(task, agent)
     if not presets:
         raise QfolioError(f"{agent} has no preset for {task}; {_fitting(task, agent)}.")

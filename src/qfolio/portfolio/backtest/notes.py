@@ -1,6 +1,6 @@
 """What a backtest has to say of its strategies besides their figures, in sentences."""
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from qfolio.core.text import amount, plural
 from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.folder import AgentConfig
-from qfolio.portfolio.backtest.folds import Fold, fewest
+from qfolio.portfolio.backtest.folds import fewest
 from qfolio.portfolio.backtest.replay import Entry, Replay
 from qfolio.portfolio.backtest.statistics.verdict import lost_everything
 from qfolio.portfolio.mandate import checks
@@ -22,9 +22,19 @@ BARELY = 1e-3
 """Risk that exceeds a limit by a smaller share of it is a rounding error."""
 
 
+GENEROUS = 0.15
+"""A rate of cash a year, over a whole test, that few currencies have had."""
+
+
 def beforehand(agents: Mapping[str, AgentConfig], replay: Replay) -> list[str]:
     """What is known of a backtest's settings before it is run."""
-    return [*shortened(agents, replay), *mandated(replay), *unread(replay)]
+    return [
+        *shortened(agents, replay),
+        *unknown(agents, replay),
+        *mandated(replay),
+        *unread(replay),
+        *generous(replay),
+    ]
 
 
 def shortened(agents: Mapping[str, AgentConfig], replay: Replay) -> list[str]:
@@ -38,14 +48,15 @@ def shortened(agents: Mapping[str, AgentConfig], replay: Replay) -> list[str]:
     ]
 
 
-def unknown(tasks: Mapping[str, Portfolio], folds: Sequence[Fold]) -> list[str]:
+def unknown(agents: Mapping[str, AgentConfig], replay: Replay) -> list[str]:
     """A note on each signal that is unknown in all rows that a fold trains on."""
+    folds, year = replay.folds, replay.prices.periods_per_year
     found = {
         label: count
-        for task in tasks.values()
+        for agent in agents.values()
         for label, signal in zip(
-            signals.labels(task.signals),
-            signals.parse(task.signals, float(task.year)),
+            signals.labels(agent.task.get("signals", "")),
+            signals.parse(agent.task.get("signals", ""), year),
             strict=True,
         )
         if (count := sum(signal.rows >= fold.train.stop for fold in folds))
@@ -66,6 +77,18 @@ def unread(replay: Replay) -> list[str]:
     return [
         f"No cost reads the {plural('column', len(names))} {listing(names)}; if {which} is the "
         f'rate that cash earns, add --cost-model "itemized(cash_rate=column:{names[0]})".'
+    ]
+
+
+def generous(replay: Replay) -> list[str]:
+    """A note on cash that earns so much that its rate may be in percent."""
+    rates = np.log(replay.growth[:, 0])
+    rate = float(rates.mean() * replay.prices.periods_per_year)
+    if rate <= GENEROUS:
+        return []
+    return [
+        f"Cash earns {100 * rate:.0f}% a year over the test; if cash_rate is in percent, divide it "
+        "by 100 (0.03 is 3% a year)."
     ]
 
 

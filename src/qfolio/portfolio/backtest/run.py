@@ -429,7 +429,6 @@ class Backtest:
         entries = {name: entry for each in (*found, others) for name, entry in each.items()}
         return entries, [
             *notes.beforehand(self.config.agents, replay),
-            *notes.unknown(self.tasks, self.folds),
             *notes.left_out(replay),
             *notes.brief(replay),
             *said,

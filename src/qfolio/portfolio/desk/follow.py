@@ -121,10 +121,11 @@ class Following:
         said += [self._retrain(), *([self.note] if self.note else [])]
         if live.differences:
             last = live.differences[-1]
+            total, most = (figure(x, "+,.2f") for x in (live.flows.sum(), last.money))
             said.append(
                 f"Holdings differed from those expected {amount(len(live.differences), 'time')}, "
-                f"by {live.flows.sum():+,.2f} in all (deposits, other fills), last on {last.date}, "
-                f"most in {last.where} ({last.money:+,.2f}); this is not counted as a return."
+                f"by {total} in all (deposits, other fills); this is not counted as a return. The "
+                f"last time, on {last.date}, {last.where} differed most, by {most}."
             )
         if unfilled := [found.unfilled for found in live.differences if found.unfilled]:
             said.append(

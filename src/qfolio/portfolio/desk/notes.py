@@ -133,8 +133,10 @@ def not_traded(allocation: Allocation, earlier: Sequence[Record]) -> list[str]:
     They are not, if they are also those of a later record, or the same, after its trades.
     """
     for record in reversed(earlier):
-        # Cash may have earned interest since, or paid a fee.
+        # Cash may have earned interest since, or paid a fee; alone, it tells how much there is.
         before = np.allclose(allocation.shares, record.shares, rtol=1e-9, atol=1e-5)
+        if not any(record.shares):
+            before &= abs(allocation.cash - record.cash) <= 0.01 * abs(record.cash)
         if before and any(record.trades):
             return [
                 f"The holdings are those of record {record.number} before its trades; if "

@@ -207,7 +207,9 @@ def _in_order(
     for line in known[1:][steps < 0].tolist():
         if line not in repeated:
             unsorted[line] = f"the date {day(moments[line])} comes after a later one"
-    findings.rows(repeated, spot, f"Remove one of the two {one}s.")
+    set_back = any(moments[line] != moments[line].astype("M8[D]") for line in repeated)
+    utc = ", or write times in UTC if the clocks were set back" if set_back else ""
+    findings.rows(repeated, spot, f"Remove one of the two {one}s{utc}.")
     findings.rows(unsorted, spot, f"Sort the {one}s, oldest first.")
     return lines
 
