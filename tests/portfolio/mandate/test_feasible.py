@@ -90,6 +90,19 @@ def test_what_a_mandate_with_loans_draws_is_allowed():
     assert float(drawn[:, 0].max()) <= -0.2 + 2e-6
 
 
+@pytest.mark.parametrize(("left", "most"), [(0.1, 0.1), (0.5, 0.2)])
+def test_an_order_spends_no_more_than_what_is_left_of_the_year(left, most):
+    spending = mandated(turnover=0.2).spending(jnp.asarray(left))
+    assert float(spending.limits.turnover) == pytest.approx(most)
+
+
+def test_short_positions_add_to_the_gross_exposure():
+    limits = {"assets": {"floor": -0.5}, "exposure": {"gross": 1.0}}
+    made = feasible(mandate_text(limits, "AB"), np.ones(2, bool))
+    found = made.violations(np.array([0.6, 0.8, -0.4]))
+    assert found["gross exposure is too high by"] == pytest.approx(0.2)
+
+
 def test_no_rounding_makes_a_loan():
     fully = feasible(mandate_text({"cash": {"max": 0.0}}, "ABCDE"), np.ones(5, bool))
     random = np.random.default_rng(1)

@@ -6,6 +6,7 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.limits import (
+    buyable,
     feasible,
     largest_weight,
     lots,
@@ -193,6 +194,9 @@ GROUP = {"assets": ["XLE", "XOM"]}
          "2 holdings at their caps leave 40% in cash"),
         ({"assets": {"cap": 0.3}, "trading": {"holdings": 1}, "cash": {"max": 0.1}},
          "1 holding at its cap leaves 70% in cash, and cash is at most 10%"),
+        ({"assets": {"cap": {"SPY": 0.2, "TLT": 0.6, "XLE": 0.1, "XOM": 0.1}},
+          "trading": {"holdings": 1}, "cash": {"max": 0.3}},
+         "1 holding at its cap leaves 40% in cash, and cash is at most 30%"),
         ({"assets": {"cap": 2}, "cash": {"min": -3, "max": -2}, "exposure": {"gross": 2}},
          "cash of at most -200% and gross exposure of at most 200% clash"),
         ({"assets": {"floor": 0.1}, "trading": {"holdings": 3}}, "4 assets have a floor above 0"),
@@ -217,6 +221,17 @@ def test_limits_that_clash_are_refused_with_their_names(mandate, message):
         checks.require(mandate_text(mandate, ASSETS), ALL)
 
 
+@pytest.mark.parametrize(
+    "mandate",
+    [
+        {"assets": {"cap": 2.0}, "cash": {"min": -1.0}, "exposure": {"gross": 2.0, "margin": 0.5}},
+        {"assets": {"floor": 0.1}, "trading": {"holdings": 4}},
+    ],
+)
+def test_limits_that_just_fit_are_met(mandate):
+    checks.require(mandate_text(mandate, ASSETS), ALL)
+
+
 def test_numbers_of_numpy_are_numbers():
     given = {"assets": {"cap": np.float64(0.4), "forbidden": np.array(["TLT"])},
              "trading": {"holdings": np.int64(3)}}  # fmt: skip
@@ -231,9 +246,12 @@ def test_what_is_unusual_is_said():
     bound = {"assets": {"cap": 0.1}, "groups": {"s": {"E": {**GROUP, "floor": 0.2}}}}
     notes = notes_on(mandate_text(bound, ASSETS), ALL)
     assert "no choice for s E: its floor, 20%" in notes[1]
-    assert notes_on(mandate_text({"cash": {"max": 0.1}}, ASSETS), ALL) == []
-    [note] = notes_on(mandate_text({"trading": {"smallest_trade": 0.3}}, ASSETS), ALL)
+    for limit in ("min", "max"):
+        assert notes_on(mandate_text({"cash": {limit: 0.1}}, ASSETS), ALL) == []
+    large = mandate_text({"trading": {"smallest_trade": 0.3}}, ASSETS)
+    [note] = notes_on(large, ALL)
     assert note.startswith("The smallest trade, 30%, is more than an equal weight, 25%")
+    assert notes_on(large, np.arange(4) < 2) == []  # of two, which is 50%
     file = {"assets": ["spy", "xl-e", "XOM", "gld"], "cap": 0.3, "ignore_unknown": True}
     notes = notes_on(mandate_text({"groups": {"sector": {"Energy": file}}}, ASSETS), ALL)
     assert [note.partition(":")[0] for note in notes] == [
@@ -242,6 +260,8 @@ def test_what_is_unusual_is_said():
     ]
     [note] = checks.unusual("", np.ones(15, bool), 0.05)
     assert note == "The cap of 5% for each of 15 assets forces at least 25% cash."
+    [note] = checks.unusual("", np.arange(15) < 10, 0.05)
+    assert note == "The cap of 5% for each of 10 assets forces at least 50% cash."
     assert checks.unusual("", ALL, 0.25) == checks.unusual("", ALL) == []
 
 
@@ -277,6 +297,15 @@ def test_a_line_of_a_file_of_groups_without_an_asset_is_passed_over(tmp_path, mo
     assert made.groups["sector"]["Index"].assets == ("SPY",)
 
 
+def test_files_of_a_spreadsheet_are_read(tmp_path):
+    """They begin with a byte order mark, and cells with a space."""
+    plain = Mandate.read(written(tmp_path))
+    marked = {"mandate.toml": FILE, "groups.csv": GROUPS.replace(",E", ", E")}
+    for name, text in marked.items():
+        (tmp_path / name).write_text(text, encoding="utf-8-sig")
+    assert Mandate.read(tmp_path / "mandate.toml") == plain
+
+
 def test_a_file_of_groups_may_name_assets_of_other_tables(tmp_path):
     mandate = Mandate.read(written(tmp_path)).changed(["cash.max=1.0"])
     assert "other" in mandate.groups["sector"]["Energy"].assets
@@ -302,6 +331,48 @@ def test_a_cap_above_1_holds_where_there_are_loans_or_shorts(mandate, most, high
     assert largest_weight(text) <= 1  # of baselines, which have neither
 
 
+def test_the_highest_cap_is_the_largest_weight():
+    caps = dict(zip(ASSETS, (0.2, 0.6, 0.1, 0.1), strict=True))
+    assert largest_weight(mandate_text({"assets": {"cap": caps}}, ASSETS)) == 0.6
+
+
+@pytest.mark.parametrize(
+    ("mandate", "gross"),
+    [
+        ({"assets": {"cap": 0.5}}, 1),  # a long-only one has its wealth alone
+        ({"assets": {"cap": 0.4, "floor": -0.1}}, 1.6),
+        ({"assets": {"cap": 0.1, "floor": -0.4}}, 1.6),
+        ({"assets": {"cap": 0.4, "floor": -0.1}, "exposure": {"gross": 3}}, 1.6),
+        ({"assets": {"cap": 2}, "cash": {"min": -1}, "exposure": {"gross": 1.5}}, 1.5),
+    ],
+)
+def test_gross_exposure_is_bounded_by_all_caps_and_floors(mandate, gross):
+    assert feasible(mandate_text(mandate, ASSETS), ALL).gross == pytest.approx(gross)
+
+
+def test_what_is_forbidden_or_only_sold_short_cannot_be_bought():
+    assets = {"forbidden": ["TLT"], "floor": -0.2, "cap": {"XLE": -0.1, "XOM": 0.0}}
+    assert buyable(mandate_text({"assets": assets}, ASSETS)).tolist() == [True, False, False, False]
+
+
+def test_short_sales_raise_no_more_cash_than_there_may_be():
+    made = feasible(mandate_text({"assets": {"floor": -0.5}}, ASSETS), ALL)
+    found = made.violations(np.array([1.2, 0.1, -0.3, 0, 0]))
+    assert found["cash is above its maximum by"] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("costs", "model"),
+    [
+        ({}, ""),
+        ({"minimum": 1.0, "cash_rate": "0.03"}, "itemized(minimum=1.0, cash_rate=0.03)"),
+        ({"model": "proportional", "cost": 0.002}, "proportional(cost=0.002)"),
+    ],
+)
+def test_costs_name_their_model_and_its_settings(costs, model):
+    assert Mandate.of({"costs": costs}).cost_model == model
+
+
 def test_floors_yield_where_assets_cannot_be_traded():
     mandate = {"assets": {"cap": 0.3, "floor": {"XOM": 0.1}}, "cash": {"max": 0.2},
                "groups": {"sector": {"E": {**GROUP, "floor": 0.25}}}}  # fmt: skip
@@ -310,3 +381,10 @@ def test_floors_yield_where_assets_cannot_be_traded():
     made, lowered = checks.relaxed(feasible(text, np.array([True, True, False, False])))
     assert sorted(x.partition(" by ")[0] for x in lowered) == ["cash", "sector E"]
     assert max(np.max(x) for x in made.violations(np.array([0.4, 0.3, 0.3, 0, 0])).values()) <= 1e-9
+
+
+def test_floors_yield_to_the_number_of_holdings():
+    """Of a floor of 50%, one asset at its cap of 30% leaves 20% out of reach."""
+    mandate = {"assets": {"cap": 0.3}, "groups": {"sector": {"E": {**GROUP, "floor": 0.5}}},
+               "trading": {"holdings": 1}}  # fmt: skip
+    assert checks.relaxed(feasible(mandate_text(mandate, ASSETS), ALL))[1] == ["sector E by 20%"]

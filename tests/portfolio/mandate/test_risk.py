@@ -180,7 +180,9 @@ def _without_risk(allowed: Mandated) -> Mandated:
     return dataclasses.replace(allowed, risk=None)
 
 
-def test_risk_is_known_without_later_prices():
+@pytest.mark.parametrize("room", [2**24, 0])
+def test_risk_is_known_without_later_prices(monkeypatch, room):
+    monkeypatch.setattr("qfolio.portfolio.mandate.risk.ROOM", room)
     prices = table()
     task, row = portfolio(prices, {"volatility": 0.1, "tracking_error": 0.05}), 100
     other = prices.values.copy()
@@ -238,6 +240,8 @@ def test_what_it_is_measured_against_must_be_known():
         Mandate.of({"benchmark": "SPY", "risk": {"tracking_error": 0.05}}).text(ASSETS)
     text = Mandate.of({"benchmark": "A", "risk": {"tracking_error": 0.05}}).text(ASSETS)
     assert '"benchmark":"A"' in text
+    own = {"tracking_error": 0.05, "benchmark": "B"}
+    assert '"benchmark":"B"' in Mandate.of({"benchmark": "A", "risk": own}).text(ASSETS)
     assert "benchmark" not in Mandate.of({"benchmark": "A", "risk": {"volatility": 0.1}}).text(
         ASSETS
     )
@@ -302,6 +306,24 @@ def test_what_forces_risk_is_named_if_no_row_allows_as_little():
         checks.require_safe(task.mandate, [risky, risky])
     checks.require_safe(task.mandate, [risky, calmer(risky, 0.1)])
     checks.require_safe(mandate_text({"cash": {"max": 0.05}}, ASSETS), iter([]))
+
+
+def test_least_risk_up_to_a_twentieth_above_its_limit_counts_as_met():
+    task = portfolio(table(), {"volatility": 0.02}, cash={"max": 0.05})
+    risky = feasible(task.mandate, np.ones(5, bool)).knowing(task.risk_at(jnp.array(300)))
+    least = checks._least_risk(risky, "volatility", 0.0)
+    checks.require_safe(task.mandate, [calmer(risky, 1.03 * 0.02 / least)])
+    with pytest.raises(QfolioError, match="cannot be met: volatility"):
+        checks.require_safe(task.mandate, [calmer(risky, 1.07 * 0.02 / least)])
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_least_risk_of_all_rows_is_said(order):
+    task = portfolio(table(), {"volatility": 0.001}, cash={"max": 0.05})
+    risky = feasible(task.mandate, np.ones(5, bool)).knowing(task.risk_at(jnp.array(300)))
+    least = 50 * checks._least_risk(risky, "volatility", 0.0)
+    with pytest.raises(QfolioError, match=f"volatility is at least {least:.3g}% at the start"):
+        checks.require_safe(task.mandate, [risky, calmer(risky, 0.5)][::order])
 
 
 @pytest.mark.parametrize(
