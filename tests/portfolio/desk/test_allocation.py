@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import json
 
 import numpy as np
 import pytest
@@ -23,6 +24,16 @@ PRICES = Prices(
     np.array([[10.0, 50], [20, 40]]),
 )
 FREE, FEE = Proportional(0.0), Itemized(0.0, fixed=5.0, capital=1000.0)
+
+
+def recorded(ledger, allocation, **more):
+    """Adds an allocation to a ledger: the record, and what is said of it."""
+    held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
+    facts = {
+        "agent": "x", "policy": None, "made": "", "version": "", "whole_shares": False,
+        "digests": {"prices": "", "settings": "", "holdings": held},
+    }  # fmt: skip
+    return ledger.append(allocation, PRICES, keep_prices=False, **facts | more)
 
 
 def plan(weights, shares, cash, cost=0.01, **options):
@@ -294,13 +305,36 @@ def test_prices_are_stale_a_day_after_the_longest_pause_of_their_market():
         require_fresh(short, "2025-01-08")
 
 
-def test_rows_in_utc_are_not_after_today_in_an_evening_of_the_west(monkeypatch):
-    class Yesterday(datetime.date):
+def today_is(off):
+    """A calendar that is some days off that of UTC."""
+
+    class Elsewhere(datetime.date):
         @classmethod
         def today(cls):
-            return datetime.datetime.now(datetime.UTC).date() - datetime.timedelta(days=1)
+            return datetime.datetime.now(datetime.UTC).date() + datetime.timedelta(days=off)
 
-    monkeypatch.setattr("datetime.date", Yesterday)
+    return Elsewhere
+
+
+@pytest.mark.parametrize(
+    ("away", "fresh", "stale"),
+    [
+        (slice(20, 32), "2025-01-02T09:00", "2025-01-02T10:00"),  # 16 hours, and a day
+        (slice(740, 760), "2025-01-07T17:00", "2025-01-07T18:00"),
+    ],
+)
+def test_pauses_count_up_to_a_week_and_if_they_are_of_the_last_year(away, fresh, stale):
+    """Of rows at 9 and 17 o'clock, those of 6 days are missing long ago, or of 10 days lately."""
+    twice = hourly(9, 17, days=400)
+    dates = np.delete(twice.dates, away)
+    prices = Prices(dates, ("A",), np.ones((len(dates), 1)))
+    require_fresh(prices, fresh)
+    with pytest.raises(QfolioError, match="The prices are stale"):
+        require_fresh(prices, stale)
+
+
+def test_rows_in_utc_are_not_after_today_in_an_evening_of_the_west(monkeypatch):
+    monkeypatch.setattr("datetime.date", today_is(-1))
     now = np.datetime64("now", "s")
     latest = Prices(now - np.arange(3)[::-1] * np.timedelta64(3600, "s"), ("A",), np.ones((3, 1)))
     assert require_fresh(latest, None) < datetime.timedelta(minutes=5)
@@ -308,6 +342,14 @@ def test_rows_in_utc_are_not_after_today_in_an_evening_of_the_west(monkeypatch):
         require_fresh(
             dataclasses.replace(latest, dates=latest.dates + np.timedelta64(1, "D")), None
         )
+
+
+def test_rows_in_the_time_of_the_east_are_not_younger_than_now(monkeypatch):
+    """In Tokyo it is up to 9 hours later than in UTC."""
+    monkeypatch.setattr("datetime.date", today_is(1))
+    hours = np.arange(7, 10) * np.timedelta64(3600, "s")
+    latest = Prices(np.datetime64("now", "s") + hours, ("A",), np.ones((3, 1)))
+    assert require_fresh(latest, None) == datetime.timedelta()
 
 
 @pytest.mark.parametrize("whole", [False, True])
@@ -366,11 +408,7 @@ def test_only_what_is_traded_counts_as_turnover(tmp_path):
         allocation = Allocation.of(policy, PRICES, np.array([250.0, 125.0]), 0.0)
         assert allocation.trades.any() != lots
         assert allocation.turnover == pytest.approx(turnover)
-        held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
-        made, _ = ledger.append(
-            allocation, PRICES, keep_prices=False, agent="x", policy=None, made="", version="",
-            digests={"prices": str(lots), "settings": "", "holdings": held}, whole_shares=lots,
-        )  # fmt: skip
+        made, _ = recorded(ledger, allocation, whole_shares=lots)
         assert made.turnover == pytest.approx(turnover)
 
 
@@ -382,11 +420,7 @@ def test_a_record_is_found_by_its_day_or_time(tmp_path):
         allocation = Allocation.of(
             policy, dataclasses.replace(PRICES, dates=dates), np.zeros(2), 100.0
         )
-        held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
-        ledger.append(
-            allocation, PRICES, keep_prices=False, agent="x", policy=None, made="", version="",
-            digests={"prices": at, "settings": "", "holdings": held}, whole_shares=False,
-        )  # fmt: skip
+        recorded(ledger, allocation)
     for date, number in (
         ("2024-12-31", 3), ("2024-12-31 00:00", 1), ("2024-12-31T00:00:00", 1),
         ("2024-12-31 15:00:00", 2), ("2024-12-31T15:00", 3), ("2024-12-31 15:00:30", 3),
@@ -395,3 +429,78 @@ def test_a_record_is_found_by_its_day_or_time(tmp_path):
     for date in ("2024-12-30", "2024-12", "2024-12-31 15", "2024-12-31 16:00"):
         with pytest.raises(QfolioError, match=f"no allocation of '{date}'; its latest are of"):
             ledger.on(date)
+
+
+def test_the_last_record_of_a_date_is_the_one_that_counts(tmp_path):
+    """What it has already is not recorded again; what only earlier ones have, is."""
+    ledger = Ledger(tmp_path)
+    poor, rich = (plan([0.5, 0.5, 0], [0, 0], cash) for cash in (100.0, 200.0))
+    numbers = [recorded(ledger, each)[0].number for each in (poor, poor, rich, poor)]
+    assert numbers == [1, 1, 2, 3]
+    assert [record.supersedes for record in ledger.records()] == [None, 1, 2]
+    for before, number in ((None, 3), (3, 2), (2, 1)):
+        assert [record.number for record in ledger.current(before)] == [number]
+    other, said = recorded(ledger, plan([0.4, 0.6, 0], [0, 0], 100.0))
+    assert other.number == 4
+    assert said.endswith("It supersedes record 3 of the same date, which had other orders.")
+
+
+def test_a_record_never_takes_the_number_of_another(tmp_path):
+    ledger = Ledger(tmp_path)
+    for cash in (100.0, 200.0):
+        recorded(ledger, plan([0.5, 0.5, 0], [0, 0], cash))
+    (tmp_path / "0001.json").unlink()
+    assert recorded(ledger, plan([0.5, 0.5, 0], [0, 0], 300.0))[0].number == 3
+
+
+def test_a_record_whose_lists_do_not_fit_is_damaged(tmp_path):
+    ledger, path = Ledger(tmp_path), tmp_path / "0001.json"
+    recorded(ledger, plan([0.5, 0.5, 0], [0, 0], 100.0))
+    content = json.loads(path.read_text())
+    for name in ("trades", "weights_after"):
+        path.write_text(json.dumps(content | {name: content[name][1:]}))
+        with pytest.raises(QfolioError, match=r"is damaged .*its lists do not fit its assets"):
+            ledger.records()
+
+
+@pytest.mark.parametrize(
+    ("cash", "agent"),
+    [(60.0, "x"), (40.0, "x"), (48.0, "y")],
+)
+def test_after_its_trades_only_other_money_or_another_agent_is_recorded(tmp_path, cash, agent):
+    """50 of 100 buy A, and a fee takes 2; or 10 are paid in or out."""
+    ledger = Ledger(tmp_path)
+    recorded(ledger, plan([0.5, 0.5, 0], [0, 0], 100.0, cost=0.0))
+    with pytest.raises(QfolioError, match="are those of record 1 of 2024-12-31 after its trades"):
+        recorded(ledger, plan([0.5, 0.5, 0], [2.5, 0], 48.0, cost=0.0))
+    later = plan([0.5, 0.5, 0], [2.5, 0], cash, cost=0.0)
+    assert recorded(ledger, later, agent=agent)[0].number == 2
+
+
+def test_an_asset_without_a_price_is_no_part_of_the_account():
+    """Of 200, half is in A, which rises to 72.5%: 7.25 shares of 20, or 7 whole ones."""
+    prices = dataclasses.replace(PRICES, values=np.array([[10.0, np.nan], [20.0, np.nan]]))
+    policy = Fixed([0.275, 0.725, 0], FREE)
+    found = Allocation.of(policy, prices, np.array([5.0, 0.0]), 100.0, whole_shares=True)
+    assert found.wealth == 200
+    assert found.turnover == pytest.approx(0.2)
+    told = found.to_json()
+    assert (told["cash_weight"], told["cash_weight_after"]) == pytest.approx((0.275, 0.3))
+    assert told["assets"] == [
+        {"asset": "A", "price": 20, "weight_now": 0.5, "weight": pytest.approx(0.725),
+         "weight_after": 0.7, "trade_shares": 2, "trade_money": 40},
+        {"asset": "B", "price": None, "weight_now": 0, "weight": 0, "weight_after": 0,
+         "trade_shares": 0, "trade_money": 0},
+    ]  # fmt: skip
+
+
+class Sparing(Fixed):
+    """Keeps as much in cash as has been spent."""
+
+    def weights(self, prices, holdings=None, *, spent=0.0):
+        return {"cash": spent, "A": 1 - spent, "B": 0.0}
+
+
+def test_a_policy_knows_what_has_been_spent_of_the_year():
+    found = Allocation.of(Sparing([1, 0, 0], FREE), PRICES, np.zeros(2), 100.0, spent=0.3)
+    np.testing.assert_allclose(found.weights, [0.3, 0.7, 0])
