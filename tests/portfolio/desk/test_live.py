@@ -1,6 +1,7 @@
 """The ledger marked to market, against replays and by hand."""
 
 import dataclasses
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -168,6 +169,8 @@ def test_a_trade_that_waits_a_row_by_hand():
         [by_hand([[10.0], [20.0], [30.0]], 0.0, 100.0, 10.0)[1]], prices, Proportional(0.0), 1
     )
     assert poor.short == 1
+    prices, short = by_hand([[10.0], [10.0], [10.0]], 0.0, 100.0, 10.02)
+    assert mark([short], prices, Proportional(0.0), lag=1).short == 1  # by 0.2% of the wealth
 
 
 def told(found, records):
@@ -250,6 +253,7 @@ def test_an_account_is_wiped_out_once():
     np.testing.assert_allclose(found.returns, [0, -1, 0])
     np.testing.assert_allclose(found.wealth, [50, -10, 30])
     assert found.ruin == prices.dates[2]
+    np.testing.assert_allclose(found.gross, [2, np.inf, 80 / 30])
     none = np.zeros(3)
     followed = Following(
         "x", [one], found, none, none, none, "y", none, "", np.ones((3, 3)), none + 1, 252, None,
@@ -259,6 +263,17 @@ def test_an_account_is_wiped_out_once():
     assert "WIPED OUT on 2024-01-03: the account's debts exceeded what it owned." in said
     assert not any("consistent" in each or "differed" in each for each in said)
     assert mark([one], prices.between(None, 2), Proportional(0.0), lag=0).ruin is None
+
+
+def test_an_account_that_owes_more_than_it_owns_trades_no_more():
+    prices, one = by_hand([[10.0], [4.0], [4.0]], 10.0, -50.0, -5.0)
+    found = mark([one], prices, Proportional(0.01), lag=1)
+    np.testing.assert_array_equal((found.costs, found.cash, found.wealth), [[0], [-50], [-10]])
+
+
+def test_a_short_position_adds_to_the_gross_exposure():
+    prices, one = by_hand([[10.0], [10.0]], -5.0, 150.0, 0.0)
+    np.testing.assert_allclose(mark([one], prices, Proportional(0.0), lag=0).gross, [0.5])
 
 
 def test_sharpe_ratios_are_of_returns_over_cash():
@@ -427,6 +442,16 @@ def test_a_split_and_a_deposit_earn_nothing():
     np.testing.assert_allclose(found.flows, [0, 0, 500])
 
 
+def test_costs_of_a_trade_are_no_withdrawal():
+    """10 shares are bought for 100 / 0.99 a row later, when the next allocation knows of them."""
+    prices, one = by_hand([[10.0]] * 4, 0.0, 1000.0, 10.0)
+    then: dict[str, Any] = {"shares": [10.0], "cash": 1000 - 100 / 0.99, "trades": [0.0]}
+    two = msgspec.structs.replace(one, number=2, date="2024-01-02", **then)
+    found = mark([one, two], prices, Proportional(0.01), lag=1)
+    np.testing.assert_allclose(found.costs, [100 / 0.99 - 100, 0], atol=1e-9)
+    np.testing.assert_allclose(found.flows, 0, atol=1e-9)
+
+
 def test_an_order_of_before_a_split_buys_as_much_after_it():
     """50 shares at 10 are 100 units of a table that is adjusted for a later split of 2."""
     prices, one = by_hand([[5.0], [5.0], [6.0]], 0.0, 1000.0, 50.0)
@@ -444,12 +469,24 @@ def test_an_order_is_void_once_its_asset_is_delisted():
     np.testing.assert_array_equal(found.wealth, [1000])
 
 
+def test_a_holding_that_is_delisted_becomes_cash():
+    prices, one = by_hand([[10.0], [8.0], [8.0]], 10.0, 20.0, 0.0)
+    ended = dataclasses.replace(prices, listed=np.array([[True], [False], [False]]))
+    found = mark([one], ended, Proportional(0.01), lag=0)
+    np.testing.assert_allclose(
+        (found.cash, found.wealth, found.gross), [[100] * 2, [100] * 2, [0] * 2]
+    )
+
+
 def test_a_ledger_that_does_not_fit_is_refused():
     prices, one = by_hand([[10.0], [20.0]], 1.0, 0.0, 0.0)
     with pytest.raises(QfolioError, match="empty"):
         mark([], prices, Proportional(0.0), 1)
     with pytest.raises(QfolioError, match="have no row of 2024-01-01, on which record 1"):
         mark([one], prices.between(1, None), Proportional(0.0), 1)
+    earlier = price_table(np.ones((2, 1)), dates=days(2, "2023-12-30"))
+    with pytest.raises(QfolioError, match="2023-12-30 to 2023-12-31, have no row of 2024-01-01"):
+        mark([one], earlier, Proportional(0.0), 1)
     with pytest.raises(QfolioError, match="other assets"):
         mark([one], table(), Proportional(0.0), 1)
     assert len(mark([one], prices, Proportional(0.0), lag=1).returns) == 0

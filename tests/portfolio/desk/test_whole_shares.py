@@ -7,6 +7,7 @@ import pytest
 
 from qfolio.portfolio.costs import Proportional
 from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.whole_shares import whole_shares
 from qfolio.portfolio.mandate.limits import mandate_text
 from qfolio.portfolio.prices.table import Prices
 
@@ -186,6 +187,39 @@ def test_the_rounding_is_nearly_the_best_where_all_is_invested_in_few_lots():
         ahead.append((distance(found.trades, found.cash_after) - best) / ideal.wealth)
     assert (np.array(ahead) <= 1e-9).mean() >= 0.95
     assert max(ahead) < 0.03
+
+
+def test_a_loan_that_is_wanted_is_taken_as_nearly_as_by_any_rounding():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        count = int(rng.integers(2, 5))
+        prices, shares = np.exp(rng.normal(4, 1, count)), rng.integers(0, 12, count).astype(float)
+        cash = float(rng.uniform(0, 200))
+        invested = 1.3 * rng.dirichlet(np.ones(count))  # of the wealth; 30% are borrowed
+        ideal = invested * (shares @ prices + cash) / prices - shares
+
+        def left(trades, cash=cash, prices=prices):
+            return cash - trades @ prices - 0.001 * abs(trades) @ prices
+
+        def distance(trades, ideal=ideal, prices=prices, left=left):
+            return np.linalg.norm([left(trades) - left(ideal), *(trades - ideal) * prices])
+
+        found = whole_shares(ideal, shares, prices, left(ideal), left)
+        choices = map(np.array, product(*({np.floor(x), np.ceil(x)} for x in ideal)))
+        allowed = (trades for trades in choices if left(trades) >= left(ideal))
+        assert distance(found) <= min(map(distance, allowed), default=np.inf) + 1e-9
+
+
+def test_the_nearest_whole_numbers_are_tried_beside_those_rounded_down():
+    """Rounding down sells 4 of A first; with 3, nothing but 42 of B is as near."""
+    prices = np.array([95.0, 11.0])
+
+    def left(trades):
+        return 194 - trades @ prices - 0.01 * abs(trades) @ prices
+
+    ideal = np.array([-3.2, 43.0])
+    found = whole_shares(ideal, np.array([9.0, 4.0]), prices, left(ideal), left)
+    assert found.tolist() == [-3, 42]
 
 
 def test_cash_is_nearer_its_target_than_by_rounding_toward_zero():
