@@ -1,12 +1,15 @@
 """What is asked of jax before it computes."""
 
 import ast
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from platform import python_version
+from types import SimpleNamespace
 
 import jax
 import pytest
@@ -69,6 +72,61 @@ def test_jax_is_set_up_before_the_first_array_of_a_task(first, tmp_path):
     assert done.stdout.strip() == f"highest {tmp_path / 'programs'}", done.stderr
 
 
+def test_what_the_user_has_set_for_jax_is_kept(tmp_path):
+    own = {
+        "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=true",
+        "JAX_DEFAULT_MATMUL_PRECISION": "bfloat16",
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "mine"),
+    }
+    code = (
+        "import os, jax; from qfolio.core import devices; devices.configure()\n"
+        "print(jax.config.jax_default_matmul_precision, jax.config.jax_compilation_cache_dir)\n"
+        "print(os.environ['XLA_FLAGS'])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | own, capture_output=True, text=True
+    )
+    config, flags = done.stdout.splitlines()
+    assert config == f"bfloat16 {tmp_path / 'mine'}"
+    assert flags.count("--xla_cpu_multi_thread_eigen") == 1
+    assert "--xla_cpu_multi_thread_eigen=true" in flags
+
+
+@pytest.mark.parametrize(
+    ("once", "flags", "options"),
+    [
+        (True, "", {"xla_backend_optimization_level": "1"}), (False, "", {}),
+        (True, "--xla_backend_optimization_level=2", {}),
+    ],
+)  # fmt: skip
+def test_what_runs_once_is_compiled_with_less_effort(monkeypatch, once, flags, options):
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    assert devices.effort(once=once) == options
+
+
+def test_a_compiler_without_an_option_compiles_without_it():
+    made = jax.jit(lambda x: x).lower(1.0).compile()
+
+    class Lowered(jax.stages.Lowered):
+        def __init__(self, message):
+            self.message = message
+
+        def compile(self, compiler_options=None, **more):
+            if compiler_options:
+                raise jax.errors.JaxRuntimeError(self.message)
+            return made
+
+    assert devices.compiled(Lowered("INVALID_ARGUMENT: No such compile option")) is made
+    with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
+        devices.compiled(Lowered("RESOURCE_EXHAUSTED: Out of memory"))
+
+
+def test_a_run_says_which_versions_it_had():
+    told = devices.circumstances("python", "jax")
+    assert told["versions"] == {"python": python_version(), "jax": jax.__version__}
+    assert "versions" not in devices.circumstances()
+
+
 def test_without_a_cache_that_can_be_written_nothing_is_said():
     code = "import qfolio, jax; qfolio.DQN(); print(jax.config.jax_compilation_cache_dir)"
     plain = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
@@ -89,6 +147,23 @@ def test_memory_counts_every_slot(monkeypatch):
     monkeypatch.setattr(devices, "host_memory", lambda: 2**20)
     with pytest.raises(QfolioError, match=r"need 0\.0 GiB"):
         devices.require_memory(state, members.slots)
+
+
+def test_memory_is_that_of_the_devices_that_have_a_member(monkeypatch):
+    """Of two with 1 MiB each."""
+    gpu = SimpleNamespace(memory_stats=lambda: {"bytes_limit": 2**20})
+    monkeypatch.setattr(jax, "devices", lambda: [gpu, gpu])
+    half, whole, double = (jax.ShapeDtypeStruct((n * 2**17,), "float32") for n in (1, 2, 4))
+    for state, count, fits in (
+        (half, 4, True), (half, 5, False), (whole, 2, True), (double, 1, False),
+    ):  # fmt: skip
+        with contextlib.nullcontext() if fits else pytest.raises(QfolioError, match="of memory"):
+            devices.require_memory(state, count)
+
+
+@pytest.mark.parametrize(("count", "room"), [(1, 5), (5, 1), (5, 0)])
+def test_there_is_a_slot_for_every_member_and_for_those_to_come(count, room):
+    assert devices.Members(count, room).slots >= 5
 
 
 def test_gpus_divide_members_among_them():

@@ -1,6 +1,7 @@
 """Names become classes: qfolio's, those of installed packages, and a user's own."""
 
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -31,9 +32,12 @@ def own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     (tmp_path / "own_parts.py").write_text(OWN)
+    (tmp_path / "qfolio_parts.py").write_text(OWN)
     (tmp_path / "broken_parts.py").write_text("import math\n\nmath.nothing\n")
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "__init__.py").write_text("1 / 0\n")
     yield "own_parts"
-    for name in ("own_parts", "broken_parts"):
+    for name in ("own_parts", "qfolio_parts", "broken_parts"):
         sys.modules.pop(name, None)
 
 
@@ -56,6 +60,34 @@ def test_a_class_in_the_current_directory(own):
     assert isinstance(registry.build("task", "own_parts:Mine", {"rows": 6}), mine)
     assert registry.own_modules(mine(), Catch(), DQN()) == ["own_parts"]
     assert registry.short("own_parts:Mine") == "Mine"
+    assert sys.path[-1] == str(Path.cwd())  # behind the libraries
+
+
+@pytest.mark.parametrize(
+    ("entry", "agent", "preset", "entrant"),
+    [
+        ("dqn", "dqn", "", "dqn"),
+        ("dqn:fast", "dqn", "fast", "dqn:fast"),
+        ("own_parts:Learner", "own_parts:Learner", "", "Learner"),
+        ("own_parts:Learner:fast", "own_parts:Learner", "fast", "Learner:fast"),
+    ],
+)
+def test_an_entry_is_an_agent_and_perhaps_its_preset(entry, agent, preset, entrant):
+    assert registry.parted(entry) == (agent, preset)
+    assert registry.entrant(entry) == entrant
+
+
+def test_an_environment_of_gymnasium_is_named_by_its_id():
+    task = type("GymnasiumTask", (), {"__module__": "qfolio.tasks.gymnasium", "id": "CartPole-v1"})
+    assert registry.name_of(task()) == "gym:CartPole-v1"
+    assert registry.short("gym:own_parts:Hopper-v0") == "gym:own_parts:Hopper-v0"
+
+
+def test_work_is_resumed_with_the_modules_and_the_place_that_it_needs(own):
+    mine, run = registry.find("task", "own_parts:Mine")(), Path("run")
+    command = "qfolio train --resume"
+    assert registry.again(command, run, mine, DQN()) == f"{command} run --trust own_parts"
+    assert registry.again(command, run, DQN(), on="gpu") == f"{command} run --on gpu"
 
 
 @pytest.mark.parametrize(
@@ -74,6 +106,8 @@ def test_a_class_in_the_current_directory(own):
         ("task", "elsewhere:Mine", "a module elsewhere is neither installed nor in this folder"),
         ("task", "broken_parts:Mine", r"broken_parts cannot be imported: AttributeError: .*"
                                       r"\(broken_parts.py, line 3\)"),
+        ("task", "broken.parts:Mine",
+         r"broken\.parts cannot be imported: ZeroDivisionError: division by zero"),
         ("task", "market/kely", r"did you mean market/kelly\?"),
         ("task", "markt/kelly", r"did you mean market/kelly\?"),
         ("task", "market/foo", "choose from market/kelly, .*, market/leverage, market/liquidation"),
@@ -101,6 +135,14 @@ def test_a_folder_runs_no_code_that_nobody_else_names(own):
     for name in ("os:system", "own_parts:number"):
         with pytest.raises(QfolioError, match=f"there is no task '{name}'"):
             registry.build("task", name, {})
+
+
+def test_a_module_whose_name_only_begins_like_qfolios_is_not_trusted(own):
+    with pytest.raises(QfolioError, match="add --trust qfolio_parts "):
+        registry.build("task", "qfolio_parts:Mine", {})
+    assert "qfolio_parts" not in sys.modules
+    mine = registry.find("task", "qfolio_parts:Mine")()
+    assert registry.own_modules(mine) == ["qfolio_parts"]
 
 
 def test_installed_packages_need_no_trust(installed):
