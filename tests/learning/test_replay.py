@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from equinox import filter_jit as jit
 
+from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Transition
-from qfolio.learning.priorities import FAN, Priorities
-from qfolio.learning.replay import Experience, Replay, cut, join
+from qfolio.learning.priorities import FAN, ImportanceSchedule, Priorities
+from qfolio.learning.replay import Experience, Replay, ReplayConfig, cut, join
 from qfolio.learning.targets import n_step
 from qfolio.portfolio.task import Portfolio
 
@@ -27,6 +28,16 @@ def chi_square(counts, expected):
 
 def test_keeps_the_latest_rows():
     np.testing.assert_array_equal(filled(6, 5).rows[:, 0], [6, 7, 8, 9, 4, 5])
+
+
+def test_rows_of_several_steps_are_appended_in_their_order():
+    replay = jit(filled(8, 1).extend)(jnp.arange(2, 6))
+    np.testing.assert_array_equal(replay.rows[:, 0], [0, 1, 2, 3, 4, 5, 0, 0])
+
+
+@pytest.mark.parametrize(("writes", "rows"), [(0, [0, 0]), (1, [0, 1]), (3, [4, 5]), (4, [6, 7])])
+def test_the_latest_rows_are_those_written_last(writes, rows):
+    np.testing.assert_array_equal(filled(6, writes).latest(), rows)
 
 
 def test_rounds_the_capacity_up_to_whole_writes():
@@ -148,6 +159,8 @@ def test_the_last_step_is_kept_where_it_is_asked_for():
     kept = Experience.of(rollout, with_last=True)
     assert kept.last is not None
     assert (kept.last.tolist(), kept.terminal.tolist()) == ([True, True], [True, False])
+    ended = Experience.of(rollout, time_limit_terminal=True)
+    assert ended.terminal.tolist() == [True, True]
 
 
 def test_positions_are_stored_and_recalled_as_the_views_that_were_seen():
@@ -168,6 +181,28 @@ def test_positions_are_stored_and_recalled_as_the_views_that_were_seen():
     again = replay.at(jnp.arange(5)).recalled(task)
     assert eqx.tree_equal(again.observation, seen)
     assert eqx.tree_equal(again.next_observation, following)
+
+
+def config(**changes):
+    given = {"num_envs": 2, "batch_size": 8, "n_steps": 1, "replay_capacity": 16,
+             "learning_starts": 0}  # fmt: skip
+    return ReplayConfig(**given | changes)
+
+
+def test_a_buffer_must_hold_what_learning_needs():
+    config(learning_starts=16).check()
+    config(n_steps=8).check()
+    for changes in ({"learning_starts": 17}, {"n_steps": 9}):
+        with pytest.raises(QfolioError, match="replay_capacity is 16, less than learning_starts"):
+            config(**changes).check()
+
+
+@pytest.mark.parametrize(
+    ("changes", "steps"),
+    [({"learning_starts": 10}, 4), ({"learning_starts": 11}, 5), ({"n_steps": 5}, 4), ({}, 0)],
+)
+def test_a_warm_up_ends_before_the_step_that_fills_the_buffer(changes, steps):
+    assert config(**changes).warm_up == steps
 
 
 def priorities_of(values):
@@ -246,3 +281,15 @@ def test_importance_weights_by_hand():
     np.testing.assert_allclose(weights(index, 1.0), [1, 1 / 2, 1 / 4])
     np.testing.assert_allclose(weights(index, 0.5), [1, 2**-0.5, 1 / 2], rtol=1e-6)
     np.testing.assert_allclose(weights(index, 0.0), [1, 1, 1])
+
+
+def test_priorities_follow_the_errors():
+    """A row without an error can be drawn again."""
+    off = jnp.array([16.0, 1 / 16, 0.0])
+    found = jit(priorities_of(np.ones(3)).update)(jnp.arange(3), off, 0.25)
+    np.testing.assert_allclose(found.of(jnp.arange(3)), [2, 0.5, 1e-6**0.25], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("updates", "exponent"), [(0, 0.4), (50, 0.7), (100, 1.0), (200, 1.0)])
+def test_the_exponent_of_importance_rises_to_1(updates, exponent):
+    assert float(ImportanceSchedule(0.4, 100.0)(jnp.array(updates))) == pytest.approx(exponent)
