@@ -128,6 +128,18 @@ def test_small_trades_are_left_out_and_others_made():
                                atol=1e-6)  # fmt: skip
 
 
+@pytest.mark.parametrize("more", [0.0, 0.01])
+def test_where_no_trade_can_be_left_out_all_are_or_none(more):
+    """Without B's, D's is too small; then F's. A sixth asset is one holding too many."""
+    limits = {"cash": {"max": 0.0}, "trading": {"holdings": 5, "smallest_trade": 0.05}}
+    made = feasible(mandate_text(limits, "ABDEFG"), np.ones(6, bool))
+    made = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), made)
+    held = jnp.array([0, 0.2, 0.2, 0.1, 0.3 - more, 0.2, more])
+    wanted = jnp.array([0, 0.4, 0.16, 0.158, 0.1325, 0.1495, 0.0])
+    expected = wanted if more else held
+    np.testing.assert_allclose(made.project(wanted, held), expected, atol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "turnover", "best", "longer", "longest"),
@@ -179,6 +191,15 @@ def test_the_largest_weights_are_kept():
     found = np.asarray(made.project(wanted, wanted))
     assert np.flatnonzero(found[1:] > 0).tolist() == [0, 2, 4, 6]  # with those that floors need
     assert largest(made.violations(found)) <= 1e-6
+
+
+def test_those_are_kept_that_turnover_allows():
+    """The nearest two, B and C, need a sale of all of A; besides D, 29% may be traded, not 30%."""
+    limits = {"assets": {"forbidden": ["D"]}, "trading": {"holdings": 2, "turnover": 0.59}}
+    made = feasible(mandate_text(limits, "ABCD"), np.ones(4, bool))
+    made = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), made)
+    wanted, held = jnp.array([0.4, 0, 0.3, 0.3, 0]), jnp.array([0, 0.3, 0.2, 0.2, 0.3])
+    np.testing.assert_allclose(made.project(wanted, held), [0.59, 0.21, 0.2, 0, 0], atol=1e-5)
 
 
 def test_a_mandate_has_the_same_limits_whatever_can_be_traded():
