@@ -12,6 +12,7 @@ from qfolio.adapters import gym
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.market import RUIN
 from qfolio.portfolio.prices.table import Prices
 
 import probes
@@ -55,6 +56,16 @@ def test_an_episode_ends_at_the_horizon_or_before():
     cliff.reset(seed=0)
     *_, end = [cliff.step(action) for action in (0, *[1] * 11, 2)]  # up, along the edge, down
     assert end[2:4] == (True, False)
+    with pytest.raises(QfolioError, match="reset"):
+        cliff.unwrapped.step(0)
+
+
+def test_chance_is_another_at_each_step_and_in_each_episode():
+    bets, pendulum = gym.TaskEnv("market/kelly"), gym.TaskEnv("pendulum")
+    bets.reset(seed=0)
+    stake = np.array([0, 1], np.float32)
+    assert {bets.step(stake)[1] > 0 for _ in range(20)} == {True, False}  # some won, others lost
+    assert len({tuple(pendulum.reset()[0].tolist()) for _ in range(5)}) == 5
 
 
 def test_its_steps_are_those_of_the_task():
@@ -142,6 +153,7 @@ def test_its_wealth_is_that_of_the_replay(lag, task):
     for start in (env.unwrapped.first, 20, env.unwrapped.last):
         (_, _, begun), *steps = play(env, options={"start": start})
         assert len(steps) == HORIZON
+        assert begun["date"] == begun["return_date"] == str(prices.dates[start])[:10]
         infos = [info for _, _, info in steps]
         decisions = np.array([info["target"] for info in infos])
         replay = simulate(prices.values, decisions, first=start, **terms)
@@ -182,7 +194,8 @@ def test_a_mandate_with_shorts_and_a_loan_is_obeyed():
 def test_ruin_ends_the_episode():
     env = environment(cost_model="itemized(fixed=1000,capital=100)")
     env.reset(seed=0)
-    _, _, terminated, truncated, _ = env.step([0.0, 1, 0, 0])
+    _, reward, terminated, truncated, _ = env.step([0.0, 1, 0, 0])
+    assert reward == pytest.approx(np.log(RUIN))
     assert terminated
     assert not truncated
     with pytest.raises(QfolioError, match="over"):
@@ -296,6 +309,12 @@ def test_what_is_seen_ends_today():
     assert not np.array_equal(seen["features"], seen_too["features"])
 
 
+def test_an_episode_knows_nothing_of_the_one_before():
+    env = environment(reward="differential-sharpe")
+    first, again = (play(env, options={"start": 20}) for _ in range(2))
+    assert [reward for _, reward, _ in again] == [reward for _, reward, _ in first]
+
+
 def test_rewards_by_name():
     prices, target = table(), [0.0, 0.5, 0.5, 0.0]
     growth = {}
@@ -376,6 +395,10 @@ def test_a_line_of_text():
     assert env.render() == "2020-01-11  wealth 1.0000  cash 100%\n"
     env.step([0.0, 1.0, 0, 0])
     assert "a 100%" in env.render()
+    short = environment(render_mode="ansi", mandate={"assets": {"floor": -0.3}}, cost=0.0)
+    short.reset(options={"start": 10})
+    short.step([-0.3, 0.5, 0])
+    assert "a -30%, b 50%" in short.render()
 
 
 def test_without_gymnasium_it_says_what_to_install(monkeypatch):

@@ -1,5 +1,6 @@
 """The bar of ``qfolio.Progress``, in a notebook (a stand-in for IPython) and without one."""
 
+import re
 import sys
 import types
 
@@ -48,6 +49,23 @@ def test_a_notebook_shows_how_far_it_is(shown, monkeypatch):
     assert any("0 of 2 jobs  return 2  1,234 steps/s" in picture for picture in shown)
     assert 'value="1.0000"' in shown[-1]
     assert "2 of 2 jobs" in shown[-1]
+
+
+def test_jobs_that_come_later_leave_the_others_as_they_are(shown, monkeypatch):
+    """So does a record without a share; returns that are no numbers do not count."""
+    monkeypatch.setattr("qfolio.adapters.progress.EVERY", 0.0)
+    with qfolio.tracked(qfolio.Progress()), Log(None).opened(kind="run") as log:
+        log.queue(["a"])
+        log.write("running", job="a")
+        log.job("a").record(5, {"return": [1.0]}, share=0.5)
+        log.queue(["a", "b"])
+        assert 'value="0.2500"' in shown[-1]
+        log.write("record", job="a", step=6, values={"return": [4.0, float("nan")]})
+        assert 'value="0.2500"' in shown[-1]
+        assert "return 4" in shown[-1]
+        for job in "ab":
+            log.write("done", job=job)
+    assert re.search(r"100%  2 of 2 jobs  return 4  \d+\.\d s</div>", shown[-1])
 
 
 def test_the_time_left_of_a_resumed_training_follows_from_what_was_done_since(shown, monkeypatch):

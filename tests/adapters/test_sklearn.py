@@ -272,6 +272,22 @@ def test_arrays_are_taken_to_follow():
     np.testing.assert_array_equal(again.returns, named.returns)
 
 
+def test_dates_with_and_without_a_time_zone_have_no_order():
+    x = returns()
+    fitted = model().fit(x[:TRAIN])
+    with pytest.raises(ValueError, match=r"or those of the returns learned have a time zone"):
+        fitted.predict(x[TRAIN:].tz_localize("UTC"))
+    named = x[TRAIN:].set_axis([f"day {i:02}" for i in range(len(x) - TRAIN)])
+    np.testing.assert_array_equal(fitted.predict(named).returns, fitted.predict(x[TRAIN:]).returns)
+
+
+def test_agents_of_other_seeds_learn_otherwise():
+    x = returns()
+    first, again, other = (model(seed=n).fit(x[:TRAIN]) for n in (0, 0, 7))
+    np.testing.assert_array_equal(first.weights_, again.weights_)
+    assert not np.array_equal(first.weights_, other.weights_)
+
+
 def test_combinatorial_folds():
     """Windows come from rows before the fold, even where later ones were trained on."""
     x = returns(80)
@@ -296,7 +312,8 @@ def test_beside_skfolios_own_models():
 
 def test_its_portfolio_can_be_sent_and_copied_but_not_scaled():
     x = returns()
-    fitted = model(portfolio_params={"name": "mine", "annualization_factor": 12}).fit(x[:TRAIN])
+    params = {"name": "mine", "annualization_factor": 12, "weight_drift": False}
+    fitted = model(portfolio_params=params).fit(x[:TRAIN])
     portfolio = fitted.predict(x[TRAIN:])
     for other in (pickle.loads(pickle.dumps(portfolio)), portfolio.copy()):
         assert other.name == "mine"
@@ -343,6 +360,8 @@ def test_it_goes_on_learning_day_by_day(agent):
     assert by_hand.observations_.equals(x.index[3 : TRAIN + 3])
     old, new = (p.learner.optimizer.count for p in (before, by_hand.policy_))
     assert (new > old).all()
+    if agent == "pathwise":  # three times 8 episodes of 10 steps, of which 4 × 5 make an update
+        assert (new - old == 3 * 8 * 10 / (4 * 5)).all()
     with pytest.raises(ValueError, match="new rows only"):
         by_hand.partial_fit(x[TRAIN + 2 : TRAIN + 5])
     rows = x[TRAIN + 3 : TRAIN + 6]
@@ -395,6 +414,7 @@ def test_interest_moves_the_weights_at_the_end():
     lends = model(max_weight=0.1, settings={**TINY, "cost_model": costs})  # most of it is cash
     found = lends.fit(x[:TRAIN]).predict(x[TRAIN:])
     before, after = found.simulation.weights[-1], found.ending_weights
+    assert lends.weights_.max() <= 0.1 + 1e-6
     grown = after / before[1:] / (1 + x.iloc[-1].to_numpy())
     np.testing.assert_allclose(grown, grown[0], rtol=1e-12)
     interest = (1 - after.sum()) / before[0] / grown[0] - 1

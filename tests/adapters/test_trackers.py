@@ -82,6 +82,29 @@ def test_tensorboard_gets_every_record(tmp_path):
     assert scalars == [("loss", 10, 2.0), ("a/loss", 20, 5.0)]
 
 
+def test_tensorboard_is_up_to_date_after_each_job(monkeypatch, tmp_path):
+    """Ctrl-C may end what follows."""
+    told: list[str] = []
+
+    class Writer:
+        def __init__(self, folder):
+            told.append(folder)
+
+        def flush(self):
+            told.append("flush")
+
+        def close(self):
+            told.append("close")
+
+    module = types.SimpleNamespace(SummaryWriter=Writer)
+    monkeypatch.setitem(sys.modules, "tensorboardX", module)
+    with tracked(*trackers(["tensorboard"])), Log(tmp_path).opened(kind="run") as log:
+        log.write("running", job="a")
+        for event in ("done", "stopped", "failed"):
+            log.write(event, job="a", error="")
+    assert told == [str(tmp_path / "tensorboard"), "flush", "flush", "flush", "close"]
+
+
 def test_tensorboard_needs_a_folder():
     with (
         pytest.raises(QfolioError, match="set one with out"),
