@@ -8,22 +8,25 @@ import sys
 import types
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 
 from qfolio.agents.dqn import DQN
 from qfolio.agents.ppo import PPO
 from qfolio.commands.progress import JobsProgress
 from qfolio.core.devices import places
 from qfolio.core.errors import QfolioError
+from qfolio.core.fields import number
 from qfolio.core.statistics import interquartile_mean, regret
 from qfolio.core.text import four_digits
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
 from qfolio.experiments.comparison.conclusion import conclusion, share
 from qfolio.experiments.comparison.measure import measure
-from qfolio.experiments.comparison.operations import operations_per_step
+from qfolio.experiments.comparison.operations import _operations, operations_per_step
 from qfolio.experiments.comparison.ranking import (
     Result,
     area,
@@ -172,6 +175,29 @@ def test_ranking_by_return_where_no_optimum_is_known():
     )
 
 
+def test_among_many_pairs_chance_needs_more_to_be_ruled_out():
+    """Each of three pairs has 2 of the 12,870 ways to choose 8 of 16: three times as many count."""
+    ranking = rank({name: result(GOOD - 10 * i) for i, name in enumerate("abc")})
+    np.testing.assert_allclose([pair["p"] for pair in ranking["pairs"]], 3 * 2 / 12_870)
+
+
+def test_the_time_to_arrive_is_a_share_of_the_training():
+    """Half of the steps, at 4 s for all."""
+    early = result(GOOD, curve=(-300.0, -105.0, -101.0), seconds=4.0)
+    ranking = rank({"early": early, "late": result(BAD)})
+    (near,) = (x for x in ranking["agents"]["early"]["within"] if x["threshold"] == 0.1)
+    assert (near["steps"], near["seconds"]) == (500, 2.0)
+
+
+def test_the_fewest_steps_and_the_least_time_may_be_those_of_two():
+    frugal = result(GOOD, steps=500, seconds=2000.0)
+    said = conclusion(rank({"frugal": frugal, "swift": result(ALIKE, seconds=1234.0)}))
+    assert said[-1] == (
+        "To settle within 10% of the optimum, frugal needs the fewest steps (500) and swift the "
+        "least time (1,234 s a seed)."
+    )
+
+
 def test_agents_that_cannot_be_told_apart_are_said_so():
     said = conclusion(rank({"a": result(GOOD), "b": result(ALIKE), "c": result(BAD)}))
     assert said[0].startswith("a ends nearest to the exact optimum: its regret is 1.6% (95%")
@@ -265,6 +291,24 @@ def test_operations_are_counted_by_hand():
     assert operations(double=True) == (act + learn + 2 * 8 * 112) / 4
 
 
+def test_operations_of_loops_branches_and_convolutions_by_hand():
+    """A product of 2 × 3 and 3 × 4 takes 48, and one output of the convolution 2 · 3 · 4."""
+    left, right, seen, kernel = (jnp.ones(x) for x in ((2, 3), (3, 4), (1, 3, 10), (5, 3, 4)))
+
+    def twice(table):
+        return table @ (right @ right.T)
+
+    def count(function, *given):
+        return _operations(jax.make_jaxpr(function)(*given).jaxpr)
+
+    assert count(lambda x: x @ right, left) == 48
+    assert count(lambda x: lax.scan(lambda y, _: (y, y @ right), x, length=5)[1], left) == 5 * 48
+    assert count(twice, left) == 72 + 36
+    branches = lambda x: lax.cond(x[0, 0] > 0, twice, lambda x: x @ jnp.ones((3, 3)), x)  # noqa: E731
+    assert count(branches, left) == 72 + 36  # the larger one
+    assert count(lambda x: lax.conv(x, kernel, (1,), "VALID"), seen) == 5 * 7 * 2 * 3 * 4
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A comparison that was never interrupted."""
@@ -320,6 +364,14 @@ def test_a_comparison_in_its_folder(finished):
     assert again.finish() == content
 
 
+def test_seeds_of_environments_in_python_take_turns_on_any_number_of_devices(finished, monkeypatch):
+    kept = Run.open(finished[0].place("slow"))
+    seconds = kept.summary()["seconds_train"]
+    assert measure(kept, 4).seconds_per_seed == seconds
+    monkeypatch.setattr("qfolio.experiments.comparison.measure.HostPopulation", object)
+    assert measure(kept, 4).seconds_per_seed == seconds / 3
+
+
 @pytest.mark.parametrize("stop", ["ctrl-c", "crash"])
 def test_resuming_gives_the_same(finished, tmp_path, stop):
     run = Comparison.create(tiny(), seeds=3, out=tmp_path / "run")
@@ -340,7 +392,9 @@ def test_resuming_gives_the_same(finished, tmp_path, stop):
         trained.append((job.name, done, share))
         return []
 
+    run.failures = {"quick": "It diverged."}
     run.run(listen)
+    assert run.failures == {}  # it was tried again
     assert trained == [("quick", 0.5, 0.5)]  # of the whole, with what was done before
     for name, expected in finished[0].results.items():
         assert run.results[name].returns == expected.returns
@@ -437,8 +491,20 @@ def test_agents_that_cannot_be_graded_are_left_out(executor, tmp_path):
     assert run.finished
 
 
-def noted(tmp_path, first, second, steps=1000):
-    """The notes on two agents with tasks of their own, as if they were trained."""
+class Delayed(Kelly):
+    """Its bets begin later, with the same odds."""
+
+    delay: float = number(0.0)
+
+    def reset_market(self, key):
+        return super().reset_market(key) + self.delay
+
+
+def noted(tmp_path, first, second, steps=1000, graded="ab"):
+    """The notes on two agents with tasks of their own, as if they were trained.
+
+    graded: those whose optimum is known.
+    """
     agent = DQN(**TINY)
     optimum = first.optimum().returns(comparing.start_keys()).mean()
     other = second.optimum().returns(comparing.start_keys()).mean()
@@ -448,8 +514,10 @@ def noted(tmp_path, first, second, steps=1000):
     }
     run = Comparison.create(entrants, seeds=8, out=tmp_path / "run")
     run.results = {
-        "a": result(GOOD, optimum=float(optimum), curve=[-1.0] * 20),
-        "b": result(GOOD, optimum=float(other), curve=[-1.0] * 20, steps=steps),
+        "a": result(GOOD, optimum=float(optimum) if "a" in graded else None, curve=[-1.0] * 20),
+        "b": result(
+            GOOD, optimum=float(other) if "b" in graded else None, curve=[-1.0] * 20, steps=steps
+        ),
     }
     return run.notes()
 
@@ -465,9 +533,23 @@ def test_tasks_that_differ_are_checked(tmp_path):
     assert "Their exact optima differ, too: each regret is a share of the agent's own" in other
     (longer,) = noted(tmp_path / "3", Kelly(menu="grid:2"), Kelly(menu="grid:2", horizon=50))
     assert "Their lengths of episodes and exact optima differ" in longer
-    task = Kelly(menu="grid:2")
-    (budget,) = noted(tmp_path / "4", task, task, steps=3000)
-    assert budget.startswith("Budgets differ: from 1,000 environment steps a seed (a)")
+    task, likelier = Kelly(menu="grid:2"), Kelly(menu="grid:2", probability=0.531)
+    (odds,) = noted(tmp_path / "7", task, likelier)
+    assert "Their exact optima differ, too" in odds
+    (budget,) = noted(tmp_path / "4", task, task, steps=1060)
+    assert budget.startswith("Budgets differ: from 1,000 environment steps a seed (a) to 1,060")
+    assert noted(tmp_path / "5", task, task, steps=1050) == []
+    (begun,) = noted(tmp_path / "6", Delayed(menu="grid:2"), Delayed(menu="grid:2", delay=1.0))
+    assert "Their start states differ, too: each regret is a share of the agent's own" in begun
+
+
+def test_returns_without_an_optimum_are_comparable_if_tasks_are_alike(tmp_path):
+    first, longer = Kelly(menu="grid:2"), Kelly(menu="grid:2", horizon=50)
+    for known in ("", "a"):
+        (unknown,) = noted(tmp_path / f"1{known}", first, longer, graded=known)
+        assert "Their lengths of episodes differ, too: returns are not comparable." in unknown
+    (alike,) = noted(tmp_path / "2", first, Kelly(menu="grid:4"), graded="")
+    assert "Their start states and lengths of episodes are the same (this was checked)" in alike
 
 
 def test_agents_that_do_not_fit_are_refused_before_anything_is_trained(tmp_path):
