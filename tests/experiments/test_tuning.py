@@ -31,7 +31,15 @@ from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Trial, best_of
 from qfolio.experiments.tuning.run import Progress, Tuning, tuning_keys
 from qfolio.experiments.tuning.search import dimension, positions
-from qfolio.experiments.tuning.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
+from qfolio.experiments.tuning.sensitivity import (
+    ENOUGH,
+    Effect,
+    Outcome,
+    Sensitivity,
+    sensitivity,
+    short,
+    verdicts,
+)
 from qfolio.experiments.tuning.trials import trials_jobs
 from qfolio.report.figures.tuning import draw_progress
 from qfolio.report.sweep import Sweep
@@ -112,6 +120,7 @@ def test_a_diverging_member_leaves_the_others_alone(task, agent):
         ("learning_rate", "1e-3..2e-3", "linear"),
         ("learning_rate", "linear:1e-4..1e-2", "linear"),
         ("learning_rate", "log:1e-3..2e-3", "log"),
+        ("learning_rate", "1.23446e-4..1.23456e-2", "log"),  # of which four digits are outside
         ("discount", "0.9..0.99", "near-one"),
         ("discount", "0.9..0.95", "linear"),
         ("discount", "0.001..1", "log"),
@@ -141,6 +150,9 @@ def test_positions_by_hand():
     assert dimension("discount", "0.9..0.999", DQN).position(0.99) == pytest.approx(0.5)
     assert dimension("discount", "0.9..0.999", DQN).at(0.5) == pytest.approx(0.99)
     assert dimension("hidden", "8|16", DQN).position("16") == 0.75
+    space = [dimension("discount", "0.9..0.99", DQN)]
+    for outside, place in ((0.8, 0), (0.999, 1)):
+        np.testing.assert_array_equal(positions(space, {"discount": outside}), [place])
 
 
 def test_what_is_usually_searched_surrounds_the_agents_own_values():
@@ -157,6 +169,8 @@ def test_what_is_usually_searched_surrounds_the_agents_own_values():
     for name in ("huber_delta", "input_gain"):
         assert report[name] == dimension(name, search.USUAL[name], DQN)
     assert str(report["tau"]) == "0.1..1.0"
+    half = report["discount"].around(0.5)  # 10 times what is missing would be more than all
+    assert (half.low, half.high) == (0.001, 0.95)
     assert {dim.name for dim in search.usual(Pathwise())} == {
         "learning_rate", "max_grad_norm", "reward_scale"
     }  # fmt: skip
@@ -198,6 +212,13 @@ def test_spaces_that_hold_no_agent_leave_no_folder(ranges, says, tmp_path, task,
     with pytest.raises(QfolioError, match=says):
         start(tmp_path / "s", task, agent, *ranges)
     assert not list(tmp_path.iterdir())
+
+
+def test_as_many_programs_as_may_be_are_made(task, agent):
+    eight = "1|2|3|4|5|6|7|8"
+    space = search.parse([f"hidden={eight}", f"batch_size={eight}"], DQN)
+    agents = search.require_buildable(agent, task, space)
+    assert len({str(settings.describe(one)) for one in agents}) == search.PROGRAMS == 64
 
 
 # The search
@@ -408,16 +429,23 @@ def proposals(work):
     return [(trial.values, trial.is_preset, trial.at_random) for trial in work.journal.trials()]
 
 
-@pytest.mark.parametrize("killed", [[0], [1, 4], [5]])
-def test_a_killed_search_proposes_what_an_unbroken_one_does(
-    killed, tmp_path, task, agent, monkeypatch
-):
-    """killed: batches that the process does not live to finish. Half of 18 trials are random."""
+@pytest.fixture
+def quick(monkeypatch):
+    """Nothing is trained, and a learning rate of 10⁻³ is best: the seeds that were asked for."""
+    asked = list[list[int]]()
 
-    def train(work, agents, *rest):
-        return np.array([[-abs(math.log10(one.learning_rate) + 3)] for one in agents.values()])
+    def train(work, agents, seeds, *rest, **options):
+        asked.append(list(seeds))
+        near = [-abs(math.log10(one.learning_rate) + 3) for one in agents.values()]
+        return np.repeat(np.array(near)[:, None], len(seeds), 1)
 
     monkeypatch.setattr(Tuning, "trained", train)
+    return asked
+
+
+@pytest.mark.parametrize("killed", [[0], [1, 4], [5]])
+def test_a_killed_search_proposes_what_an_unbroken_one_does(killed, tmp_path, task, agent, quick):
+    """killed: batches that the process does not live to finish. Half of 18 trials are random."""
     unbroken = start(tmp_path / "unbroken", task, agent, trials=18, batch=3, seeds=1)
     unbroken.run()
     work = start(tmp_path / "broken", task, agent, trials=18, batch=3, seeds=1)
@@ -429,6 +457,58 @@ def test_a_killed_search_proposes_what_an_unbroken_one_does(
         work._train(asked)
     assert proposals(work) == proposals(unbroken)
     assert len({str(values) for values, *_ in proposals(work)}) == 18
+
+
+def test_only_the_second_half_of_the_trials_follows_from_results(
+    tmp_path, task, agent, monkeypatch
+):
+    found = []
+    for sign in (1, -1):
+
+        def train(work, agents, *rest, sign=sign):
+            return np.array([[sign * one.learning_rate] for one in agents.values()])
+
+        monkeypatch.setattr(Tuning, "trained", train)
+        work = start(tmp_path / str(sign), task, agent, trials=18, batch=3, seeds=1)
+        work.run()
+        found.append([values for values, *_ in proposals(work)])
+    assert found[0][:9] == found[1][:9]
+    assert found[0][9:] != found[1][9:]
+
+
+def test_what_is_tried_and_what_is_graded_have_seeds_and_starts_of_their_own(
+    tmp_path, task, agent, quick, monkeypatch
+):
+    count = "qfolio.experiments.tuning.run.optimal_returns"
+    monkeypatch.setattr(count, lambda task, keys: np.array([len(keys)]))
+    work = start(tmp_path / "s", task, agent, trials=2)
+    work.run()
+    summary = work.conclude()
+    assert quick == [[0, 1], [1000, 1001]]
+    assert summary["seeds"] == [1000, 1001]
+    assert (summary["optimum"], summary["optimum_tuned_on"]) == (1024, 256)
+
+
+def test_the_time_of_a_batch_is_shared_by_its_trials(tmp_path, task, agent, quick, monkeypatch):
+    monkeypatch.setattr("qfolio.experiments.tuning.run.perf_counter", iter([1.0, 7.0]).__next__)
+    work = start(tmp_path / "s", task, agent)
+    work._train(ask(work))
+    assert [trial.seconds for trial in work.journal.trials()] == [3, 3]
+
+
+def test_a_new_number_of_trials_is_for_all_and_a_batch_for_this_process(tmp_path, task, agent):
+    folder = tmp_path / "s"
+    start(folder, task, agent)
+    here = Tuning.open(folder, trials=7, batch=3).config
+    others = Tuning.open(folder).config
+    assert (here.trials, here.batch) == (7, 3)
+    assert (others.trials, others.batch) == (7, 2)
+
+
+def test_the_first_two_trials_are_not_chosen_by_the_sampler(tmp_path, task, agent, quick):
+    work = start(tmp_path / "s", task, agent, trials=2, batch=1)
+    work.run()
+    assert [at_random for _, _, at_random in proposals(work)] == [False, True]
 
 
 def test_processes_share_a_search(tmp_path, task, agent):
@@ -584,6 +664,8 @@ def test_sensitivity_finds_what_matters():
     assert "What matters most: learning_rate" in text
     assert "hidden hardly matter" in text or "hidden and discount hardly matter" in text
     assert "The narrowest is learning_rate" in text
+    factor = float(text.partition("is robust, a factor of ")[2].rstrip("."))
+    assert factor == pytest.approx(100 ** (high - low), rel=0.05)
 
 
 def test_sensitivity_admits_what_it_does_not_know():
@@ -609,9 +691,43 @@ def test_outcomes():
     failed = 1.1  # worse than the worst by more than what is tolerated
     np.testing.assert_allclose(heights, [0.0, 1.0, -np.log10(failed), 2.0], atol=1e-12)
     np.testing.assert_allclose(known.loss(heights), [1.0, 0.1, failed, 0.01])
+    np.testing.assert_allclose(known.height([-100.0, -99.0]), 4)  # as near as 0.01%
+    assert Outcome.of([-1.0, 0.0], optimum=0.0).optimum is None  # it has no shares
     unknown = Outcome.of([1.0, 2.0, 3.0, -1e9], optimum=None)
     assert unknown.floor == 3 - 3 * 1.5
     np.testing.assert_allclose(unknown.height([2.0, math.nan, -1e9]), [2.0, -1.8, -1.5])
+
+
+def test_the_effect_of_a_setting_is_that_where_the_others_are_right():
+    """A small network loses all, whatever the discount."""
+    space, trials = made_up(60)
+    places = np.array([positions(space, trial.values) for trial in trials])
+    regrets = np.where(places[:, 2] < 0.5, 1.0, 0.01 * 10 ** (1.5 * places[:, 0]))
+    trials = [
+        trial._replace(returns=(-100.0 * (1 + regret),))
+        for trial, regret in zip(trials, regrets.tolist(), strict=True)
+    ]
+    found = sensitivity(space, trials, -100.0)
+    assert found is not None
+    (effect,) = (each for each in found.effects if each.dimension is space[0])
+    assert effect.range[0] == 0
+    assert effect.range[1] < 0.7
+
+
+@pytest.mark.parametrize(
+    ("share", "says"),
+    [
+        (0.3, "The variation comes from discount (30%), by the share that each explains alone, but "
+              "hardly any value costs more than 5 points of regret."),
+        (0.09, "No setting by itself explains a tenth of the variation."),
+    ],
+)  # fmt: skip
+def test_what_varies_but_costs_little_does_not_matter(share, says):
+    space, trials = made_up()
+    places = np.linspace(0, 1, 5)
+    effect = Effect(space[0], share, places, np.zeros(5), np.ones(5, bool))
+    found = Sensitivity(Outcome.of([-101.0, -110.0], -100.0), [effect], 0.9)
+    assert verdicts(found, trials)[1:] == [says]
 
 
 @pytest.mark.parametrize("optimum", [-100.0, None])
@@ -629,6 +745,8 @@ def test_trials_that_diverged_are_not_near_the_best(optimum):
     assert found is not None
     (effect,) = (each for each in found.effects if each.dimension is space[0])
     assert effect.range[1] < 0.95
+    best = found.outcome.height(found.outcome.best)
+    assert all(each.heights.max() <= best + 1e-9 for each in found.effects)
 
 
 @pytest.mark.parametrize(
