@@ -129,14 +129,14 @@ def test_small_trades_are_left_out_and_others_made():
 
 
 @pytest.mark.parametrize("more", [0.0, 0.01])
-def test_where_no_trade_can_be_left_out_all_are_or_none(more):
-    """Without B's, D's is too small; then F's. A sixth asset is one holding too many."""
+def test_small_trades_are_left_out_until_the_others_are_large_enough(more):
+    """Without B's, D's is too small; then F's. G is sold, as one holding too many."""
     limits = {"cash": {"max": 0.0}, "trading": {"holdings": 5, "smallest_trade": 0.05}}
     made = feasible(mandate_text(limits, "ABDEFG"), np.ones(6, bool))
     made = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), made)
     held = jnp.array([0, 0.2, 0.2, 0.1, 0.3 - more, 0.2, more])
     wanted = jnp.array([0, 0.4, 0.16, 0.158, 0.1325, 0.1495, 0.0])
-    expected = wanted if more else held
+    expected = [0, 0.38375, 0.2, 0.1, 0.11625, 0.2, 0]
     np.testing.assert_allclose(made.project(wanted, held), expected, atol=1e-6)
 
 
