@@ -120,6 +120,27 @@ def test_equal_weights_wait_for_drift_as_in_a_ledger_of_shares() -> None:
         assert 1 < (~np.isnan(found[:, 0])).sum() < len(test) / 2
 
 
+@pytest.mark.parametrize(
+    ("every", "apart"), [(1, 21), (4, 20), (5, 20), (8, 24), (13, 26), (21, 21), (30, 30)]
+)
+def test_a_monthly_baseline_decides_on_rows_of_the_calendar_about_a_month_apart(every, apart):
+    class Monthly(EqualWeight):
+        calendar = "month"
+
+        def decide(self, history: History, held: np.ndarray) -> np.ndarray:
+            asked.append(len(history.prices) - 1)
+            return super().decide(history, held)
+
+    asked: list[int] = []
+    prices, decides = table(400), np.zeros(400, bool)
+    decides[100::every] = True
+    fold = Fold("", slice(0, 100), slice(100, 390), slice(0, 100))
+    terms = AT_EVERY_ROW._replace(decides=decides)
+    orders("x", Monthly(), [fold], prices.dates, prices.values, terms=terms)
+    assert asked[0] == 100
+    assert set(np.diff(asked)) == {apart}
+
+
 def test_a_fold_without_a_row_of_the_calendar_buys_nothing() -> None:
     class Asked(EqualWeight):
         def decide(self, history: History, held: np.ndarray) -> np.ndarray:

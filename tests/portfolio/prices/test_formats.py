@@ -316,7 +316,13 @@ def test_faults_of_a_turned_table_are_named_where_they_are(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "above", ["Data of a vendor\n\n", "Prices, returns, volumes, and\nothers\n", "\na;b;c;d\n"]
+    "above",
+    [
+        "Data of a vendor\n\n",
+        "Prices, returns, volumes, and\nothers\n",
+        "\na;b;c;d\n",
+        "Title,,\n;;\nPrices,,\n",
+    ],
 )
 @pytest.mark.parametrize(("mark", "point"), [(",", "."), (";", ","), ("\t", ".")])
 def test_lines_above_the_table(tmp_path: Path, above: str, mark: str, point: str):
@@ -331,6 +337,15 @@ def test_lines_above_the_table(tmp_path: Path, above: str, mark: str, point: str
     assert f"the lines above row {count} are left out" in notes(path)
     wrong = write(tmp_path, above + body.replace(f"{ISO[1]}{mark}1", f"{ISO[1]}{mark}x"))
     assert f"row {count + 2} (" in refusal(wrong)
+
+
+@pytest.mark.parametrize("blank", ["\n", ",,\n", "\n\n"])
+def test_blank_lines_below_a_title(tmp_path: Path, blank: str):
+    """They end the table only above other text, not below the names or among the rows."""
+    some, more = rows(ISO[:2], [["1", "2"]] * 2), rows(ISO[2:], [["3", "4"]] * 2)
+    path = write(tmp_path, f"Title\ndate,A,B\n{blank}{some}{blank}{more}{blank}Source: vendor\n")
+    np.testing.assert_array_equal(load(path).values, [[1, 2], [1, 2], [3, 4], [3, 4]])
+    assert ": 'Source: vendor' …" in notes(path)[0]
 
 
 def test_lines_above_that_hide_the_names(tmp_path: Path):

@@ -115,9 +115,12 @@ def test_relatives_are_told_from_prices():
     """As prices they would revert to 1, and be bought below it at a profit."""
     table = prices()
     relatives = table / table.shift(1)
-    (error,) = findings(relatives.iloc[1:], "error")
-    assert error.message.startswith("the numbers look like price relatives, new price over old")
-    assert error.advice == "Give prices, or choose returns='relative' (--returns)."
+    for unit in (None, "percent", "fraction"):
+        (error,) = findings(relatives.iloc[1:], "error", returns=unit)
+        assert error.message.startswith("the numbers look like price relatives, new price over old")
+        assert error.advice.endswith("hoose returns='relative' (--returns).")
+    (warning,) = findings(1 + 0.2 * (relatives.iloc[1:] - 1), "warning")  # or pegged coins
+    assert warning.advice == "If so, choose returns='relative' (--returns)."
     back = load(relatives, returns="relative")
     np.testing.assert_allclose(back.values, 100 * table / table.iloc[0], rtol=1e-12)
     with pytest.raises(QfolioError, match="−100% or less"):
@@ -126,13 +129,15 @@ def test_relatives_are_told_from_prices():
     assert "taken as relative" in warning.message
 
 
-@pytest.mark.parametrize("level", [1.0, 100.0])
-def test_prices_are_told_from_returns(level: float):
+@pytest.mark.parametrize(("level", "unit", "kind"), [
+    (100.0, "percent", "error"), (100.0, "fraction", "error"), (100.0, "relative", "error"),
+    (1.0, "percent", "warning"), (1.0, "fraction", "error"),
+])  # fmt: skip
+def test_prices_are_told_from_returns(level: float, unit: str, kind: str):
     table = prices() / prices().iloc[0] * level
-    for unit in ("percent", "fraction", *(["relative"] if level > 1 else [])):
-        (error,) = findings(table, "error", returns=unit)
-        assert error.message.startswith("the numbers look like prices, not returns: none is a loss")
-        assert error.advice == "If they are prices, leave out returns (--returns)."
+    (found, *_) = findings(table, kind, returns=unit)
+    assert found.message.startswith("the numbers look like prices, not returns: none is a loss")
+    assert found.advice == "If they are prices, leave out returns (--returns)."
     rising = abs(table.pct_change()).iloc[1:]  # of funds that are valued smoothly
     assert not findings(10 * rising, "error", returns="percent")
 

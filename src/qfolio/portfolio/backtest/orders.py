@@ -156,11 +156,9 @@ def _calendar(
             f"calendar of {type(baseline).__name__} is {baseline.calendar!r}; it must be one of "
             f"{', '.join(get_args(Calendar))}."
         )
-    gives = np.ones(rows, bool)
-    if len(terms.decides):
-        gives = terms.decides
-    elif baseline.calendar == "month":
-        gives = (np.arange(rows) - folds[0].decisions.start) % month == 0
+    gives = np.asarray(terms.decides) if len(terms.decides) else np.ones(rows, bool)
+    if baseline.calendar == "month":
+        gives = _monthly(gives, folds[0].decisions.start, month)
     if baseline.calendar != "fold":
         return gives, gives
     asks = np.zeros(rows, bool)
@@ -169,6 +167,17 @@ def _calendar(
         where = np.flatnonzero(asks | gives)
         asks[where[1:]] |= (universe[where[1:]] != universe[where[:-1]]).any(axis=1)
     return asks, gives
+
+
+def _monthly(gives: Bools, first: int, month: int) -> Bools:
+    """Those of some rows that are nearest to a month apart, from the first decision on."""
+    rows = first + np.flatnonzero(gives[first:])
+    apart = month - np.median(np.diff(rows)) / 2 if len(rows) > 1 else 0
+    found, last = np.zeros(len(gives), bool), -np.inf
+    for row in rows.tolist():
+        if row - last >= apart:
+            found[row], last = True, row
+    return found
 
 
 class _Account:

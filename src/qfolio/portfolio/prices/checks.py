@@ -88,6 +88,8 @@ def cells(table: Table, choices: Choices) -> tuple[Grid | None, Findings]:
     ordered = not findings.bad
     if choices.returns:
         grid = cumulate(grid, choices.returns, findings)
+    if grid is None:
+        return None, findings
     check_cells(grid, findings)
     if not ordered or not grid.assets or len(grid.dates) < FEWEST_ROWS:
         return None, findings

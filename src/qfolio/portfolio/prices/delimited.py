@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
 from qfolio.portfolio.prices.cells import MISSING, has_decimal
+from qfolio.portfolio.prices.dates import begins_row
 from qfolio.portfolio.prices.header import Header, parse_header
 from qfolio.portfolio.prices.layout import Table
 
@@ -84,19 +86,17 @@ def _with_decimals(text: str, name: str, layout: "_Layout", plain: set[int]) -> 
 
 
 def _first_table(text: str, layout: "_Layout") -> tuple[str, str]:
-    """The text up to the first blank line below the header, and what is left out."""
-    kept: list[str] = []
-    rest = ""
-    for line in (lines := io.StringIO(text, newline="")):
-        blank = not line.strip(f"{layout.separator} \t\r\n")
-        if blank and len(kept) > layout.before:
-            rest = next((below.strip() for below in lines if below.strip()), "")
-            break
-        kept.append(line)
+    """The text up to a blank line with something else than a row below, and what is left out."""
+    lines = list(io.StringIO(text, newline=""))
+    filled = [k for k, line in enumerate(lines) if line.strip(f"{layout.separator} \t\r\n")]
     left_out = f"the lines above row {layout.before} are left out"
-    if rest:
-        left_out += f", and so is what follows the blank row {len(kept) + 1}: {quote(rest, 60)} …"
-    return "".join(kept), left_out
+    for last, after in itertools.pairwise(filled):
+        first = lines[after].split(layout.separator)[0].strip('" \r\n')
+        if last >= layout.before and after > last + 1 and not begins_row(first):
+            rest = quote(lines[after].strip(), 60)
+            left_out += f", and so is what follows the blank row {last + 2}: {rest} …"
+            return "".join(lines[: last + 1]), left_out
+    return text, left_out
 
 
 class _Layout(NamedTuple):

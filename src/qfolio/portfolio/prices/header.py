@@ -50,7 +50,7 @@ def parse_header(records: list[list[str]]) -> Header:
     French's tables have sentences above.
     """
     records = [[cell.strip() for cell in record] or [""] for record in records]
-    if header := _below_settings(records) or _below_text(records):
+    if header := _below_settings(records):
         return header
     first, second, third = (*records, [], [])[:3]
     pairs: list[Any] = list(first)
@@ -64,7 +64,7 @@ def parse_header(records: list[list[str]]) -> Header:
         or not any(is_price(part) for pair in two for part in pair)
         or (any(map(_is_value, second)) and plain(second[0]) not in ASSET_NAMES)
     ):
-        return name_columns(first)
+        return _below_text(records) or name_columns(first)
     alone = bool(third) and bool(third[0]) and not any(third[1:]) and not _is_value(third[0])
     if alone:
         pairs[0] = third[0]
@@ -102,20 +102,26 @@ def _below_settings(records: list[list[str]]) -> Header | None:
 
 
 def _below_text(records: list[list[str]]) -> Header | None:
-    """The header below lines of text; None if the first record may be the header.
+    """The header below lines of text; None if it is the first record, or cannot be told.
 
-    It has as many cells as the first row below, and another number than the line above.
+    It is a record of words above a row of numbers. The record above it has another number of cells,
+    or only the first of them, as spreadsheets write a title; else either could hold the names.
     """
-    triples = zip(records, records[1:], records[2:], strict=False)
-    for lines, (above, record, below) in enumerate(triples, 2):
+    filled = [(k, record) for k, record in enumerate(records) if any(record)]
+    for (_, above), (k, record), (_, below) in zip(filled, filled[1:], filled[2:], strict=False):
+        last = max((j for j, name in enumerate(record) if name), default=0)
         if (
-            len(above) != len(record) == len(below) > 1
+            (len(above) != len(record) or not any(above[1:]))
+            and len(record) == len(below)
+            and last > 0
+            and all(record[1:last])
             and not any(map(_is_value, record))
+            and (not record[0] or not is_missing(record[0]))
             and begins_row(below[0])
             and any(is_number(cell) or is_number(cell, ",") for cell in below[1:])
         ):
             names = record[0] or "date", *record[1:]
-            return name_columns(names)._replace(lines=lines, below_text=True)
+            return name_columns(names)._replace(lines=k + 1, below_text=True)
     return None
 
 

@@ -8,7 +8,14 @@ from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.frequency import every_day, spacing
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Block, Grid, report_cells
-from qfolio.portfolio.prices.returns import RUIN, look_like_relatives, look_like_returns
+from qfolio.portfolio.prices.returns import (
+    CLEAR,
+    DOUBTFUL,
+    RELATIVES,
+    RUIN,
+    look_like_relatives,
+    look_like_returns,
+)
 from qfolio.portfolio.prices.vocabulary import is_cash
 
 FEWEST_ROWS, FEW_ROWS = 3, 60
@@ -55,13 +62,12 @@ def check_cells(grid: Grid, findings: Findings) -> None:
             advice="Give prices, or choose returns='percent' or 'fraction' (--returns).",
         )
         return
-    if look_like_relatives(values):
-        findings.error(
-            "the numbers look like price relatives, new price over old: they are near 1, and as "
-            "often above as below",
-            advice="Give prices, or choose returns='relative' (--returns).",
-        )
+    if look_like_relatives(values, CLEAR):
+        advice = "Give prices, or choose returns='relative' (--returns)."
+        findings.error(RELATIVES, advice=advice)
         return
+    if look_like_relatives(values, DOUBTFUL):
+        findings.warn(RELATIVES, advice="If so, choose returns='relative' (--returns).")
     report_cells(
         grid, grid.prices, values == 0, "is zero",
         f"Leave the cell empty where there was no trade. {RUIN}", findings,

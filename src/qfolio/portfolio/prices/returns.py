@@ -21,13 +21,17 @@ UNKNOWN = {"percent": (-99.99, -999.0)}
 """Numbers that Kenneth French's tables have where a return is missing."""
 SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
 FEWEST = 20  # rows, or numbers, that tell what they are
-GAIN = 0.008  # usual size of a return from which some must be losses
-RELATIVE = (0.001, 0.2)  # how far the usual relative is from 1; a price of one dollar is closer
+GAIN = (0.008, 0.05)  # usual gain of a row without any loss that is doubtful, and impossible
+DOUBTFUL, CLEAR, MOST = 0.0005, 0.003, 0.2  # how far usual relatives, or prices near 1, are from 1
+RELATIVES = (
+    "the numbers look like price relatives, new price over old: they are near 1, and as often "
+    "above as below"
+)
 CHOICES = "'percent', 'fraction' or 'relative'"
 
 
-def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
-    """The grid with prices in place of simple returns from the row before.
+def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid | None:
+    """The grid with prices in place of simple returns from the row before; None if they are none.
 
     An asset's price is 100 in the row before its first return. If that row is not in the table,
     it is 100 in the row of its first return, which is then not used.
@@ -45,13 +49,19 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
         rates = (block.values - zero) * one
         known = np.isfinite(rates)
         moved = rates[known & (rates != 0)]
-        if len(moved) >= FEWEST and (moved > 0).all() and np.median(moved) >= GAIN:
-            findings.error(
-                "the numbers look like prices, not returns: none is a loss, and the usual one "
-                f"would be a gain of {np.median(moved):.2g} times the wealth",
+        if unit != "relative" and look_like_relatives(block.values, CLEAR):
+            findings.error(RELATIVES, advice="Choose returns='relative' (--returns).")
+            return None
+        gain = float(np.median(moved)) if len(moved) >= FEWEST and (moved > 0).all() else 0.0
+        if gain >= GAIN[0]:
+            report = findings.error if gain >= GAIN[1] else findings.warn
+            report(
+                "the numbers look like prices, not returns: none is a loss, and the usual gain is "
+                f"{100 * gain:.2g}%",
                 advice="If they are prices, leave out returns (--returns).",
             )
-            return grid
+            if gain >= GAIN[1]:
+                return None
         report_cells(grid, block, np.isinf(rates), "is infinite", "Correct the cell.", findings)
         report_cells(
             grid, block, known & (rates <= -1), "is −100% or less",
@@ -83,18 +93,19 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
     return replace(grid, prices=replace(block, values=values, name="price"))
 
 
-def look_like_relatives(values: np.ndarray) -> bool:
+def look_like_relatives(values: np.ndarray, least: float) -> bool:
     """Whether numbers of shape (rows, assets) are near 1 and cross it every few rows.
+
+    least: how far the usual one must be from 1.
 
     So do the first rows of prices that start at 1, and therefore a few rows tell nothing.
     """
     known = values[np.isfinite(values)]
-    low, high = RELATIVE
     if (
         len(values) < FEWEST
         or not known.size
         or (known <= 0).any()
-        or not low <= np.median(abs(known - 1)) <= high
+        or not least <= np.median(abs(known - 1)) <= MOST
     ):
         return False
     both = np.isfinite(values[1:]) & np.isfinite(values[:-1])

@@ -18,13 +18,15 @@ NEAR = 0.2  # in log: how far the high usually is from the others at most
 NEARLY_ALL = 0.99  # of the rows, on which the high is above and the low below
 OFTEN = 0.2  # of the rows, on which the open is above the close, and below it
 CHANGING = 0.15  # usual change of a day's range from row to row, as a share of the usual range
+TOUCHING = 0.01  # of the rows, and at least three, on which the open or the close is high or low
 
 
 def check_unnamed_bars(grid: Grid, rest: Rest, findings: Findings) -> None:
     """Report columns between two others that are always above and below them, and as close by.
 
     Between assets that keep their order, such as share classes of one fund, the distance changes
-    little from row to row.
+    little from row to row; and assets hardly ever have equal prices, while a day may open or close
+    at its high or low.
     """
     count = len(rest.assets)
     if not 4 <= count <= MOST or len(rest.values) < FEWEST:
@@ -38,12 +40,18 @@ def check_unnamed_bars(grid: Grid, rest: Rest, findings: Findings) -> None:
         within = [j for j in np.flatnonzero(between).tolist() if j not in (high, low)]
         pairs = itertools.combinations(within, 2)
         crossing = any(OFTEN <= above[pair] <= 1 - OFTEN for pair in pairs)
-        if crossing and _is_range(logs[:, high] - logs[:, low]):
+        inner, ends = rest.values[:, within], rest.values[:, [high, low]]
+        touches = int((inner[..., None] == ends[:, None]).any(axis=(1, 2)).sum())
+        if (
+            crossing
+            and touches >= max(3, TOUCHING * len(logs))
+            and _is_range(logs[:, high] - logs[:, low])
+        ):
             names = [grid.assets[rest.assets[j]] for j in sorted({high, low, *within})]
             top, bottom = (quote(grid.assets[rest.assets[j]]) for j in (high, low))
             findings.error(
                 f"{listing(names)} look like open, high, low and close of one asset: {top} is "
-                f"never below the others, and {bottom} never above",
+                f"never below the other three, and {bottom} never above them",
                 advice="Keep the column of closing prices, or name them open, high, low and close.",
             )
             return
