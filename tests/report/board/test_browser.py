@@ -13,6 +13,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from qfolio.experiments.events import EVENTS, read
@@ -261,6 +262,14 @@ def test_an_axis_far_from_zero_names_its_ticks_in_full(board: Board, browser: Br
         "1.2346M 1.2348M 1.235M 1.2352M",
         "0 1e+12 2e+12 3e+12",
     ]
+
+
+def test_the_axis_of_a_number_that_is_rounded_twice_is_that_of_one(
+    board: Board, browser: Browser
+) -> None:
+    browser.show(board.url, 1280)
+    axes = browser.evaluate("[[0.2, 0.2], [0.2, 0.2 + 3e-9], [0, 0]].map((x) => range(x))")
+    np.testing.assert_allclose(axes, [[0.1784, 0.2216]] * 2 + [[-1.08, 1.08]], rtol=1e-6)
 
 
 def test_the_ticks_of_an_axis_have_one_unit(board: Board, browser: Browser) -> None:

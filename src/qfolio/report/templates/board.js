@@ -507,7 +507,8 @@ function range(values) { // without the most extreme hundredth, which would flat
   const sorted = Float64Array.from(values).sort();
   const cut = sorted.length >= 200 ? Math.floor(sorted.length / 100) : 0;
   let [low, high] = extent([sorted[cut], sorted[sorted.length - 1 - cut]].filter(Number.isFinite));
-  if (low === high) { const pad = Math.abs(low) / 10 || 1; low -= pad; high += pad; }
+  const size = Math.max(Math.abs(low), Math.abs(high)); // a number is rounded to 7 digits or to 16
+  if (high - low <= 1e-6 * size) { const pad = size / 10 || 1; low -= pad; high += pad; }
   const pad = (high - low) * .04;
   return [low - pad, high + pad];
 }
