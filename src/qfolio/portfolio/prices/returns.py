@@ -20,7 +20,7 @@ RUIN = (
 UNKNOWN = {"percent": (-99.99, -999.0)}
 """Numbers that Kenneth French's tables have where a return is missing."""
 SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
-FEWEST = 20  # rows, or numbers, that tell what they are
+FEWEST = 20  # rows that tell what their numbers are
 GAIN = (0.008, 0.05)  # usual gain of a row without any loss that is doubtful, and impossible
 DOUBTFUL, CLEAR, MOST = 0.0005, 0.003, 0.2  # how far usual relatives, or prices near 1, are from 1
 RELATIVES = (
@@ -52,7 +52,8 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid | None:
         if unit != "relative" and look_like_relatives(block.values, CLEAR):
             findings.error(RELATIVES, advice="Choose returns='relative' (--returns).")
             return None
-        gain = float(np.median(moved)) if len(moved) >= FEWEST and (moved > 0).all() else 0.0
+        lossless = len(rates) >= FEWEST and moved.size and (moved > 0).all()
+        gain = float(np.median(moved)) if lossless else 0.0
         if gain >= GAIN[0]:
             report = findings.error if gain >= GAIN[1] else findings.warn
             report(
