@@ -107,9 +107,10 @@ def _checked(signal: Signal, prices: Floats) -> Floats:
                         f"The signal {name} has other values each time it is computed on the same "
                         "table; draw its random numbers from a generator with a fixed seed."
                     )
+                where = f"row {row} or earlier" if row else "row 0"
                 raise QfolioError(
-                    f"The signal {name} looks ahead: its value at row {row} or earlier changes "
-                    "when later rows are taken away."
+                    f"The signal {name} looks ahead: its value at {where} changes when later rows "
+                    "are taken away."
                 )
     return found
 
