@@ -100,8 +100,8 @@ def test_a_step_is_evidence_from_the_one_member_that_does_not_learn_from_it():
         means = state.policy.learned.members.means.coefficients
         assert len(np.unique(means, axis=0)) == count  # of other blocks each
     assert abs(found[0].total).max() > 1e-6
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(other, one, rtol=1e-4, atol=1e-9)
+    for one, other in zip(*found, strict=True):  # up to the rounding of the largest
+        np.testing.assert_allclose(other, one, rtol=1e-4, atol=2e-5 * float(abs(one).max()))
 
 
 def test_without_evidence_it_is_the_least_variance():
