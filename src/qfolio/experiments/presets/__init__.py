@@ -29,7 +29,12 @@ PRESETS: Presets = {
 def default_agent(task: str) -> str:
     """The first agent with presets for a task, or a default agent; accepts unknown tasks."""
     default = "dqn" if task in (*TASKS, "portfolio") else "ppo"
-    return next((agent for name, agent in PRESETS if name == task), default)
+    return next(iter(_suited(task)), default)
+
+
+def _suited(task: str) -> list[str]:
+    """The agents with presets for a task."""
+    return [agent for name, agent in PRESETS if name == task]
 
 
 def presets_of(task: str, agent: str) -> dict[str, Preset]:
@@ -58,8 +63,7 @@ def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
     for argument, value in {"name": name, "task": task, "agent": agent}.items():
         require_type(argument, value, str, "text")
     if ":" not in agent and agent not in AGENTS:  # others are a user's own
-        suited = [other for name, other in PRESETS if name == task] or AGENTS
-        raise QfolioError(f"there is no agent {agent!r}; {near(agent, suited)}")
+        raise QfolioError(f"there is no agent {agent!r}; {near(agent, _suited(task) or AGENTS)}")
     presets = presets_of(task, agent)
     if not presets:
         raise QfolioError(f"{agent} has no preset for {task}; {_fitting(task, agent)}.")
@@ -74,7 +78,7 @@ def _fitting(task: str, agent: str) -> str:
     """Advice on what to use instead of a task and an agent that do not fit together."""
     suited = [other for other, name in PRESETS if name == agent]
     twins = [other for other in suited if other.partition("/")[0] == task.partition("/")[0]]
-    others = f"on {task} use {listed([name for other, name in PRESETS if other == task], 'or')}"
+    others = f"on {task} use {listed(_suited(task), 'or')}"
     if twins:
         return f"use it on {listed(twins, 'or')}, or {others}"
     if suited == ["portfolio"]:

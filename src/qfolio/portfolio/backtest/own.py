@@ -297,13 +297,14 @@ def _growth(name: str, own: Own, prices: Prices, earned: slice) -> tuple[Floats,
             f"{_day(prices, earned.stop - 1)}."
         )
     levels, rows = own.values[latest], len(latest) - 1
-    fresh = int((np.diff(latest) > 0).sum())
-    notes = (
+    growth, fresh = np.asarray(levels[1:] / levels[:-1] - 1), int((np.diff(latest) > 0).sum())
+    if fresh >= OFTEN * rows:
+        return growth, ()
+    return growth, (
         f"{name} has a new level on only {fresh:,} of {rows:,} rows of the test, and stands still "
         "on the others, so figures that compare row by row, such as beta and tracking error, say "
         "little: give its levels at every row.",
     )
-    return np.asarray(levels[1:] / levels[:-1] - 1), notes if fresh < OFTEN * rows else ()
 
 
 def require_levels(name: str, own: Own, prices: Prices) -> None:

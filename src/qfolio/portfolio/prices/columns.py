@@ -214,9 +214,7 @@ def _long_columns(
     if not assets or not prices:
         return None, None
     labels = [j for j in assets if _are_labels(table.columns[j])]
-    moments = read_dates(table.columns[when]).moments
-    known = moments[~np.isnat(moments)]
-    if not labels and len(np.unique(known)) == len(known):
+    if not labels and not _repeats(table.columns[when]):
         return None, None
     if names[prices[0]] in RETURN_NAMES and not returns:
         findings.error(
@@ -232,6 +230,13 @@ def _long_columns(
     return (labels or assets)[0], prices[0]
 
 
+def _repeats(dates: np.ndarray) -> bool:
+    """Whether a date appears twice in a column."""
+    moments = read_dates(dates).moments
+    known = moments[~np.isnat(moments)]
+    return len(np.unique(known)) < len(known)
+
+
 def _are_labels(cells: np.ndarray) -> bool:
     """True for cells that are text, or few different whole numbers: prices are neither."""
     values, wrong = numbers(cells)
@@ -244,8 +249,6 @@ def _are_labels(cells: np.ndarray) -> bool:
 
 def _check_wide(table: Table, columns: list[int], when: int, findings: Findings) -> None:
     """Finds columns without a name, and names of assets, which only a long table has."""
-    moments = read_dates(table.columns[when]).moments
-    again = len(np.unique(moments)) < len(moments)
     for j in columns:
         if not table.names[j]:
             findings.error(f"column {j + 1} has no name", advice="Name it or remove it.")
@@ -257,7 +260,7 @@ def _check_wide(table: Table, columns: list[int], when: int, findings: Findings)
                 column=table.names[j],
                 advice="Name the column of prices 'price'.",
             )
-        elif again:
+        elif _repeats(table.columns[when]):
             findings.error(
                 "holds names, and dates repeat, as in a table with a row for each date and asset",
                 column=table.names[j],

@@ -13,8 +13,8 @@ from qfolio.portfolio.prices.returns import (
     DOUBTFUL,
     RELATIVES,
     RUIN,
-    look_like_relatives,
     look_like_returns,
+    usual_relative,
 )
 from qfolio.portfolio.prices.vocabulary import is_cash
 
@@ -62,11 +62,12 @@ def check_cells(grid: Grid, findings: Findings) -> None:
             advice="Give prices, or choose returns='percent' or 'fraction' (--returns).",
         )
         return
-    if look_like_relatives(values, CLEAR):
+    relative = usual_relative(values)
+    if relative >= CLEAR:
         advice = "Give prices, or choose returns='relative' (--returns)."
         findings.error(RELATIVES, advice=advice)
         return
-    if look_like_relatives(values, DOUBTFUL):
+    if relative >= DOUBTFUL:
         findings.warn(RELATIVES, advice="If so, choose returns='relative' (--returns).")
     report_cells(
         grid, grid.prices, values == 0, "is zero",

@@ -49,7 +49,7 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid | None:
         rates = (block.values - zero) * one
         known = np.isfinite(rates)
         moved = rates[known & (rates != 0)]
-        if unit != "relative" and look_like_relatives(block.values, CLEAR):
+        if unit != "relative" and usual_relative(block.values) >= CLEAR:
             findings.error(RELATIVES, advice="Choose returns='relative' (--returns).")
             return None
         lossless = len(rates) >= FEWEST and moved.size and (moved > 0).all()
@@ -94,24 +94,20 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid | None:
     return replace(grid, prices=replace(block, values=values, name="price"))
 
 
-def look_like_relatives(values: np.ndarray, least: float) -> bool:
-    """Whether numbers of shape (rows, assets) are near 1 and cross it every few rows.
-
-    least: how far the usual one must be from 1.
+def usual_relative(values: np.ndarray) -> float:
+    """How far numbers are from 1, if they are near it and cross it every few rows; else 0.
 
     So do the first rows of prices that start at 1, and therefore a few rows tell nothing.
     """
     known = values[np.isfinite(values)]
-    if (
-        len(values) < FEWEST
-        or not known.size
-        or (known <= 0).any()
-        or not least <= np.median(abs(known - 1)) <= MOST
-    ):
-        return False
+    if len(values) < FEWEST or not known.size or (known <= 0).any():
+        return 0.0
     both = np.isfinite(values[1:]) & np.isfinite(values[:-1])
     crossed = (values[1:] < 1) != (values[:-1] < 1)
-    return bool(both.any() and crossed[both].mean() >= SIGNED[0])
+    if not both.any() or crossed[both].mean() < SIGNED[0]:
+        return 0.0
+    usual = float(np.median(abs(known - 1)))
+    return usual if usual <= MOST else 0.0
 
 
 def look_like_returns(values: np.ndarray) -> bool:

@@ -36,17 +36,15 @@ def check_unnamed_bars(grid: Grid, rest: Rest, findings: Findings) -> None:
     known = np.isfinite(logs)
     above = np.array([_share(logs[:, [i]] >= logs, known[:, [i]] & known) for i in range(count)])
     for high, low in np.argwhere(above >= NEARLY_ALL).tolist():
+        if not _is_range(logs[:, high] - logs[:, low]):  # as nearly all pairs of assets
+            continue
         between = (above[high] >= NEARLY_ALL) & (above[:, low] >= NEARLY_ALL)
         within = [j for j in np.flatnonzero(between).tolist() if j not in (high, low)]
         pairs = itertools.combinations(within, 2)
         crossing = any(OFTEN <= above[pair] <= 1 - OFTEN for pair in pairs)
         inner, ends = rest.values[:, within], rest.values[:, [high, low]]
         touches = int((inner[..., None] == ends[:, None]).any(axis=(1, 2)).sum())
-        if (
-            crossing
-            and touches >= max(3, TOUCHING * len(logs))
-            and _is_range(logs[:, high] - logs[:, low])
-        ):
+        if crossing and touches >= max(3, TOUCHING * len(logs)):
             names = [grid.assets[rest.assets[j]] for j in sorted({high, low, *within})]
             top, bottom = (quote(grid.assets[rest.assets[j]]) for j in (high, low))
             findings.error(
