@@ -206,11 +206,16 @@ def test_all_places_end_before_ctrl_c_does():
     with pytest.raises(ValueError, match="one"):
         devices.side_by_side(call, 3)
     assert ended == [0, 1, 2]
+
+    def wait(place):
+        time.sleep(0.5 * place)
+        ended.append(place)
+
     ended.clear()
     main = threading.main_thread().ident
     assert main is not None
     threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
-        devices.side_by_side(call, 3)
+        devices.side_by_side(wait, 3)
     assert ended == [0, 1, 2]
     assert devices.side_by_side(lambda place: place, 1) == [0]

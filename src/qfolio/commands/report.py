@@ -48,6 +48,8 @@ def report(folder: Positional[Path], *, pdf: bool = False, trust: Modules = ()) 
 def _kind(folder: Path) -> str:
     from qfolio.core.files import read_json
 
+    if not folder.is_dir():
+        raise QfolioError(f"There is no folder {folder}.")
     path = next((folder / name for name in FILES if (folder / name).is_file()), None)
     kind = None if path is None else read_json(path).get("kind")
     if not isinstance(kind, str) or kind not in WRITERS:

@@ -184,6 +184,19 @@ def test_newest_first(tmp_path: Path):
         load(path)
 
 
+def test_percent_signs_are_of_returns(tmp_path: Path):
+    path = tmp_path / "returns.csv"
+    days = ("2024-01-31", "2024-02-29", "2024-03-31")
+    for cells, sign in ((("1.5%", "-2 %", "+0.5%"), ","), (("1,5 %", "-2%", "0,5"), ";")):
+        path.write_text(f"date{sign}A\n" + "".join(f"{d}{sign}{c}\n" for d, c in zip(days, cells)))  # noqa: B905
+        np.testing.assert_allclose(load(path, returns="percent").values[:, 0], [100, 98, 98.49])
+        for unit in (None, "fraction", "relative"):
+            with pytest.raises(
+                QfolioError, match=r"'1.5 ?%' has a percent sign.*returns='percent'"
+            ):
+                load(path, returns=unit)
+
+
 def test_currency_signs(tmp_path: Path):
     path = tmp_path / "prices.csv"
     days = ("2024-01-02", "2024-01-03", "2024-01-04")

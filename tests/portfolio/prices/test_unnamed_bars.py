@@ -26,7 +26,7 @@ def test_bars_are_told_by_their_prices(seed: int, drift: float):
     for more in ({}, {"Volumen": 1e4 * table["Hoch"] ** 2}, {"Schluss bereinigt": table["Tief"]}):
         (error,) = findings(table.assign(**more), "error")
         assert error.message.startswith("'Eröffnung', 'Hoch', 'Tief', 'Schluss'")
-        assert "'Hoch' is never below the other three, and 'Tief' never above" in error.message
+        assert "'Hoch' is never below the others, and 'Tief' never above" in error.message
     late = table.shift(100).assign(Andere=np.arange(1.0, len(DAYS) + 1))
     assert "look like open, high" in findings(late, "error", late="join")[0].message
 

@@ -17,6 +17,8 @@ MISSING = frozenset(
     {"", "-", "--", ".", "na", "n/a", "#n/a", "#n/a n/a", "<na>", "nan", "nat", "none", "null"}
 )
 CURRENCIES = frozenset("$€£¥₹₽₩₪₺₫₱₦₴₿฿")
+PERCENT = "%"
+SIGNS = CURRENCIES | {PERCENT}
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(inf|infinity)", re.I | re.A)
 _GROUPED = re.compile(r"[-+]?[1-9]\d{0,2}([,'’ \u00a0\u202f])\d{3}(\1\d{3})*(\.\d*)?", re.A)
@@ -46,11 +48,14 @@ def label(cell: Any) -> str:
 # Numbers.
 
 
-def numbers(cells: np.ndarray, decimal: str = ".") -> tuple[np.ndarray, np.ndarray]:
+def numbers(
+    cells: np.ndarray, decimal: str = ".", *, percent: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Cells as float64 (NaN: missing or not a number), and a mask of those that are not numbers.
 
     A currency sign may stand before or after a number. Groups of thousands are read where they
     cannot be anything else (1,234.50), and so is 1,234 in a column that has such numbers.
+    percent: whether a percent sign may stand there, too; 1.2% is then 1.2.
     """
     wrong = np.zeros(len(cells), dtype=bool)
     if cells.dtype.kind == "f":
@@ -59,11 +64,11 @@ def numbers(cells: np.ndarray, decimal: str = ".") -> tuple[np.ndarray, np.ndarr
     content = cells.tolist()
     for i, cell in enumerate(content):
         if not is_missing(cell):
-            number = _number(cell, decimal)
+            number = _number(cell, decimal, percent=percent)
             values[i], wrong[i] = (math.nan, True) if number is None else (number, False)
     if wrong.any() and any(isinstance(cell, str) and groups(cell, decimal) for cell in content):
         for i in np.flatnonzero(wrong).tolist():
-            number = _number(content[i], decimal, grouped=True)
+            number = _number(content[i], decimal, grouped=True, percent=percent)
             values[i], wrong[i] = (math.nan, True) if number is None else (number, False)
     return values, wrong
 
@@ -72,13 +77,13 @@ def currencies(cells: np.ndarray) -> set[str]:
     """The currency signs beside numbers."""
     if cells.dtype.kind == "f":
         return set()
-    return {_bare(cell)[1] for cell in cells.tolist() if isinstance(cell, str)} - {""}
+    return {_bare(cell)[1] for cell in cells.tolist() if isinstance(cell, str)} - {"", PERCENT}
 
 
 def not_a_number(cell: Any, decimal: str) -> str:
     """Why a cell is not a number, for a message."""
     said = str(cell).strip()
-    text, _ = _bare(said)
+    text, sign = _bare(said)
     other = "," if decimal == "." else "."
     if has_two_readings(said, decimal):
         point = text.replace(",", ".")
@@ -86,12 +91,14 @@ def not_a_number(cell: Any, decimal: str) -> str:
     if other in text and is_number(said, other):
         has, have = ("comma", "points") if other == "," else ("point", "decimal commas")
         return f"{quote(said)} has a decimal {has}, other numbers have {have}"
+    if sign == PERCENT and is_number(said, decimal):
+        return f"{quote(said)} has a percent sign"
     return f"{quote(said)} is not a number"
 
 
 def is_number(cell: str, decimal: str = ".") -> bool:
     """Whether a cell is a number with this decimal mark."""
-    return _number(cell, decimal) is not None
+    return _number(cell, decimal, percent=True) is not None
 
 
 def has_decimal(cell: str, decimal: str) -> bool:
@@ -116,14 +123,18 @@ def groups(cell: str, decimal: str) -> bool:
 
 
 def _plain(cell: str, decimal: str) -> str:
-    """The text without its currency sign, and with a point as its decimal mark."""
+    """The text without such a sign, and with a point as its decimal mark."""
     text, _ = _bare(cell)
     return text.translate(_SWAP) if decimal == "," else text
 
 
-def _number(cell: Any, decimal: str, grouped: bool = False) -> float | None:
+def _number(
+    cell: Any, decimal: str, *, grouped: bool = False, percent: bool = False
+) -> float | None:
     try:
         if isinstance(cell, str):
+            if _bare(cell)[1] == PERCENT and not percent:
+                return None
             text = _plain(cell, decimal)
             if _NUMBER.fullmatch(text):
                 return float(text)
@@ -138,12 +149,12 @@ def _number(cell: Any, decimal: str, grouped: bool = False) -> float | None:
 
 
 def _bare(cell: str) -> tuple[str, str]:
-    """The text without its currency sign, and the sign: -$5, $-5, $5 and 5 $."""
+    """The text without its currency or percent sign, and the sign: -$5, $-5, $5, 5 $ and 5%."""
     text = cell.strip()
     sign = text[:1] if text[:1] in ("+", "-") else ""
     rest = text.removeprefix(sign)
-    if rest and rest[0] in CURRENCIES:
+    if rest and rest[0] in SIGNS:
         return sign + rest[1:].lstrip(), rest[0]
-    if rest and rest[-1] in CURRENCIES:
+    if rest and rest[-1] in SIGNS:
         return sign + rest[:-1].rstrip(), rest[-1]
     return text, ""

@@ -82,7 +82,11 @@ def cells(table: Table, choices: Choices) -> tuple[Grid | None, Findings]:
     features, shared = tuple(choices.features), choices.own_columns
     returns = choices.returns is not None
     columns = find_columns(table, features, shared, choices.date, findings, returns=returns)
-    grid = None if columns is None else arrange(table, columns, findings)
+    grid = (
+        None
+        if columns is None
+        else arrange(table, columns, findings, percent=choices.returns == "percent")
+    )
     if grid is None:
         return None, findings
     ordered = not findings.bad

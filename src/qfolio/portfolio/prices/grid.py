@@ -96,8 +96,10 @@ def check_currencies(tables: Sequence[tuple[Table, Sequence[int]]], findings: Fi
         )
 
 
-def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
-    """The grid of a table; None if it would be far too large."""
+def arrange(
+    table: Table, columns: Columns, findings: Findings, *, percent: bool = False
+) -> Grid | None:
+    """The grid of a table, whose numbers may be percentages; None if it would be far too large."""
     prices = columns.prices
     if table.left_out:
         findings.note(table.left_out)
@@ -109,19 +111,21 @@ def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
     if unit:
         findings.note(f"dates are read as {unit.name}", column=table.names[columns.date])
     used = [*prices, *(j for feature in columns.features for j in feature.columns)]
-    values, wrong = _read_numbers(table, used)
+    values, wrong = _read_numbers(table, used, percent)
     undated = np.array([complaints.get(i) == NO_DATE for i in range(len(moments))], dtype=bool)
     blank = undated & np.isnan(values).all(axis=1) & ~wrong.any(axis=1)
     form = _wide if columns.asset is None else _long
     return form(table, columns, moments, complaints, values, wrong, blank, findings)
 
 
-def _read_numbers(table: Table, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def _read_numbers(
+    table: Table, columns: Sequence[int], percent: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """The columns' numbers and wrong cells, each of shape (rows, columns)."""
     count = len(table.columns[0])
     values, wrong = np.empty((count, len(columns))), np.empty((count, len(columns)), dtype=bool)
     for k, j in enumerate(columns):
-        values[:, k], wrong[:, k] = numbers(table.columns[j], table.decimal)
+        values[:, k], wrong[:, k] = numbers(table.columns[j], table.decimal, percent=percent)
     return values, wrong
 
 

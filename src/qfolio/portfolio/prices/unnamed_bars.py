@@ -49,7 +49,7 @@ def check_unnamed_bars(grid: Grid, rest: Rest, findings: Findings) -> None:
             top, bottom = (quote(grid.assets[rest.assets[j]]) for j in (high, low))
             findings.error(
                 f"{listing(names)} look like open, high, low and close of one asset: {top} is "
-                f"never below the other three, and {bottom} never above them",
+                f"never below the others, and {bottom} never above them",
                 advice="Keep the column of closing prices, or name them open, high, low and close.",
             )
             return
