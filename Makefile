@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 NOW := $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: demo test test-all check format examples bench bench-gpu docs linkcheck film release-check clean
+.PHONY: demo test test-all test-long check format examples bench bench-gpu docs linkcheck film release-check clean
 
 demo: .venv/installed
 	$(BIN)/qfolio train pendulum --no-compare --out runs/demo-$(NOW)/pendulum
@@ -19,8 +19,12 @@ test: .venv/installed-dev
 
 # All tests: those that learn for long come last, with programs optimized as users have them.
 test-all: .venv/installed-dev
-	$(BIN)/pytest -n 2 --dist loadfile -m "not optimized"
-	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile -m optimized
+	$(BIN)/pytest -n 2 --dist loadfile -m "not optimized and not long"
+	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile -m "optimized and not long"
+
+# One more learner, market or environment of a kind that `make test-all` has tested; before a release.
+test-long: .venv/installed-dev
+	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile -m long
 
 check: .venv/installed-dev
 	$(BIN)/ruff format --check

@@ -42,6 +42,8 @@ from qfolio.tasks.pendulum import Pendulum  # noqa: E402
 
 devices.configure()
 
+ENOUGH = 1.5 * 2**30
+
 
 def pytest_collection_finish():
     """Python searches for garbage rarely, and not in what has been imported.
@@ -60,13 +62,24 @@ def check_types_again():
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs():
-    """Compiled programs of one file do not stay in memory while the next ones run."""
+    """Programs of earlier files are forgotten before they fill the memory.
+
+    Until then the small ones among them need not be traced and compiled again.
+    """
     yield
     programs_of.cache_clear()
-    jax.clear_caches()
-    gc.collect()
-    if sys.platform == "linux":  # glibc keeps what was freed, gigabytes of it
-        ctypes.CDLL(None).malloc_trim(0)
+    if _memory() > ENOUGH:
+        jax.clear_caches()
+        gc.collect()
+        if sys.platform == "linux":  # glibc keeps what was freed, gigabytes of it
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+def _memory() -> float:
+    """Bytes of this process in memory; without limit where the system does not say."""
+    if sys.platform != "linux":
+        return float("inf")
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.fixture(autouse=True, scope="module")

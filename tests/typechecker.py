@@ -36,7 +36,11 @@ CALLS = 50
 """Calls of a function that are checked in a file of tests. Later ones hardly bring other types, and
 a check takes longer than many a function: a test that loops in Python took six times as long."""
 
+CLOSURES = 4
+"""Closures of one function that are checked in a file of tests: to make a check takes long, too."""
+
 _calls: Counter[int] = Counter()  # by the address of a function's code, which its closures share
+_made: Counter[int] = Counter()
 _jaxtyped = jaxtyping.jaxtyped
 
 
@@ -48,8 +52,9 @@ def install(packages: list[str]) -> None:
 
 
 def check_again() -> None:
-    """Counts calls anew."""
+    """Counts calls and closures anew."""
     _calls.clear()
+    _made.clear()
 
 
 def _first_calls(function: Any = None, *, typechecker: Any) -> Any:
@@ -58,7 +63,8 @@ def _first_calls(function: Any = None, *, typechecker: Any) -> Any:
     if not inspect.isfunction(function):
         return _jaxtyped(function, typechecker=typechecker)
     code = id(function.__code__)
-    if _calls[code] >= CALLS:  # a closure that is made again and again
+    _made[code] += 1
+    if _made[code] > CLOSURES or _calls[code] >= CALLS:
         return function
     checked = _jaxtyped(function, typechecker=typechecker)
 

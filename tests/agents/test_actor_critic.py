@@ -721,7 +721,7 @@ def test_the_spread_of_each_member_is_checked_whatever_ran_before():
 
 
 @pytest.mark.optimized
-@pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
+@pytest.mark.parametrize("agent", [pytest.param("ddpg", marks=pytest.mark.long), "td3", "sac"])
 def test_fast_presets_swing_the_pendulum_up(agent):
     """What docs/algorithms/actor_critic.md says of every seed; an idle agent loses 900%."""
     fast = preset("fast", "pendulum", agent)

@@ -181,7 +181,7 @@ def test_gpus_divide_members_among_them():
     )
     told = []
     for count in (1, 2):
-        flags = f"--xla_force_host_platform_device_count={count}"
+        flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={count}"
         done = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True,
             env=os.environ | {"XLA_FLAGS": flags},

@@ -627,7 +627,7 @@ def test_wrong_input_gets_one_sentence(tmp_path, monkeypatch, capsys, arguments,
 
 
 @pytest.mark.optimized
-@pytest.mark.parametrize("agent", ["dqn", "ppo"])
+@pytest.mark.parametrize("agent", [pytest.param("dqn", marks=pytest.mark.long), "ppo"])
 def test_the_pole_is_balanced(agent):
     preset = presets.preset("fast", "gym:CartPole-v1", agent)
     run = Run.create(
@@ -639,7 +639,11 @@ def test_the_pole_is_balanced(agent):
 
 @pytest.mark.optimized
 @pytest.mark.parametrize(
-    ("task", "returns"), [("MountainCarContinuous-v0", 85.0), ("Pendulum-v1", -170.0)]
+    ("task", "returns"),
+    [
+        ("MountainCarContinuous-v0", 85.0),
+        pytest.param("Pendulum-v1", -170.0, marks=pytest.mark.long),
+    ],
 )
 def test_actions_with_bounds_are_learned(task, returns):
     """Within a third of the budget.

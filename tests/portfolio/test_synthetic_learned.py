@@ -39,7 +39,7 @@ def test_each_preset_is_within_a_percent_of_the_optimum(task, agent):
     [
         (0.1, 0.0025, 252, 0.0),
         (0.9, 0.03, 52, 0.0),
-        (0.5, 0.01, 12, 0.03),
+        pytest.param(0.5, 0.01, 12, 0.03, marks=pytest.mark.long),
     ],
 )
 def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps, cash_rate):

@@ -84,7 +84,7 @@ def rates(worlds: int, seed: int = 0) -> dict[str, float]:
 
 @pytest.mark.slow
 def test_noise_is_no_evidence() -> None:
-    found = rates(120)
+    found = rates(60)
     assert found["beats any speed"] <= 0.05
     assert found["beats best"] <= 0.05
     assert found["less than best speed, faint"] <= 0.05
