@@ -257,6 +257,8 @@ def test_a_dumb_terminal_is_told_like_a_file(monkeypatch, capsys):
         (["backtest", "--cost-bps", "ten"], "--cost-bps is 'ten'; it must be a number."),
         (["backtest", "--late", "trimm"], "--late is 'trimm'; did you mean trim?"),
         (["backtest", "--late", "x"], "--late is 'x'; choose from error, drop-asset, trim, join."),
+        (["backtest", "--returns", "x"],
+         "--returns is 'x'; choose from fraction, percent, relative."),
         (["backtest", "--sedes", "2"], "there is no option --sedes; did you mean --seeds?"),
         (["backtest", "a.csv", "b.csv"], "there is no argument b.csv."),
         (["allocate", "run", "--ended", "None"],

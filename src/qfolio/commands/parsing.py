@@ -154,6 +154,8 @@ def refusal(box: str) -> str:
         return f"{found[1]} needs a value."
     if found := re.match(r"invalid choice '(.*)' for argument '([^']+)'\. .*\((.*)\)", said):
         known = [choice.strip(" '") for choice in found[3].split(",")]
+        if "None" in known:  # an option that may be left out; tyro lists such choices in any order
+            known = sorted({*known} - {"None"})
         return f"{found[2]} is {found[1]!r}; {near(found[1], known)}"
     found = re.match(r"Error parsing (\S+): ", said)
     values = re.findall(r"'([^']*)'", said)
