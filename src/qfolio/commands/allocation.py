@@ -70,8 +70,8 @@ def allocate(
         as_of: Day of the allocation; prices may be up to a week older, or more where their rows are
             farther apart than a day. For prices of several times a day it may be a time in UTC,
             such as 2025-12-31T15:00 (default: now).
-        update: Update the policy on the new rows first, if there are any, and store the new version
-            beside the earlier ones.
+        update: Have the policy learn from the latest rows first, if there are new ones, and store
+            the new version beside the earlier ones.
         orders: Write the trades to this CSV file, outside of the folder.
         layout: Columns of that file: generic, ib for a basket of Interactive Brokers, or alpaca or
             schwab for the fields of an order in their APIs.

@@ -170,7 +170,7 @@ _TRACED = (
 
 _COMPILED = (
     "this code is compiled before its values are known, so numpy, if, while, int and float cannot "
-    "take them; use jax.numpy, jnp.where or jax.lax"
+    "take them, nor can x[x > 0]; use jax.numpy, jnp.where or jax.lax"
 )
 
 _NOT_OWN = [

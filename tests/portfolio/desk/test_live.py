@@ -200,6 +200,9 @@ def test_holdings_that_differ_are_named_with_their_date_and_asset():
         "this is not counted as a return. The last time, on 2024-01-16, cash differed most, by "
         "+350.00."
     )
+    row = price_table(np.full((16, 3), 1.0), dates=days(16, "2024-01-01"))
+    at_the_end = mark([records[0], late], row, Proportional(0.0), lag=0)
+    assert "1 time, by +50.00 in all" in told(at_the_end, records)  # before it earns a return
     exact = mark(records, prices, Proportional(0.0), lag=0)
     assert exact.differences == []
     assert not told(exact, records)

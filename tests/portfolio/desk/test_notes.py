@@ -51,7 +51,7 @@ def test_prices_of_several_times_a_day_say_how_old_they_are():
     table, daily = (Prices(dates, ("A",), np.ones((len(dates), 1))) for dates in (hours, DAYS))
     assert not aged(table, datetime.timedelta(hours=2))
     (said,) = aged(table, datetime.timedelta(hours=3))
-    assert said.startswith("The latest prices, of 2024-01-05 12:00:00, are 3 hours old;")
+    assert said.startswith("The latest prices, of 2024-01-05 12:00:00, are 3 hours old if ")
     assert not aged(daily, datetime.timedelta(days=7))
 
 

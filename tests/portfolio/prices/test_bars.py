@@ -191,9 +191,7 @@ def test_percent_signs_are_of_returns(tmp_path: Path):
         path.write_text(f"date{sign}A\n" + "".join(f"{d}{sign}{c}\n" for d, c in zip(days, cells)))  # noqa: B905
         np.testing.assert_allclose(load(path, returns="percent").values[:, 0], [100, 98, 98.49])
         for unit in (None, "fraction", "relative"):
-            with pytest.raises(
-                QfolioError, match=r"'1.5 ?%' has a percent sign.*returns='percent'"
-            ):
+            with pytest.raises(QfolioError, match=r"'1.5 ?%' has a percent sign; .*'percent'"):
                 load(path, returns=unit)
 
 

@@ -507,3 +507,51 @@ def test_faults_in_a_folder(tmp_path: Path):
     bars(tmp_path, "a.csv", ["1", "2", "3", "4"])
     bars(tmp_path, "b.csv", ["1", "2", "-3", "4"])
     assert "'b.csv': row 4 (2024-01-31), column 'Close': the price is neg" in refusal(tmp_path)
+
+
+def test_volumes_with_letters_are_no_names(tmp_path: Path):
+    """Though a date stands in several rows, with a time beside it, or by mistake."""
+    text = "Date,Time,Open,High,Low,Close,Volume\n" + "".join(
+        f"2020-01-02,09:3{k},10,11,9,10.{k},1.{k}K\n" for k in range(6)
+    )
+    assert load(write(tmp_path, text)).values[:, 0].tolist() == [10, 10.1, 10.2, 10.3, 10.4, 10.5]
+    text = "Date,Price,Vol.\n" + rows([*ISO, ISO[-1]], [[f"{k}.5", "1.2M"] for k in range(1, 6)])
+    assert f"the date {ISO[-1]} is already in row 5" in refusal(write(tmp_path, text))
+
+
+def test_a_fund_with_a_price_and_a_net_asset_value(tmp_path: Path):
+    text = "date,ticker,close,nav\n" + rows(ISO, [["A", f"1{k}", f"2{k}"] for k in range(4)])
+    assert load(write(tmp_path, text)).values[:, 0].tolist() == [10, 11, 12, 13]
+    text = "date,ticker,nav\n" + rows(ISO, [["A", f"2{k}"] for k in range(4)])
+    assert load(write(tmp_path, text)).values[:, 0].tolist() == [20, 21, 22, 23]
+
+
+def test_the_first_of_two_tables_is_never_skipped(tmp_path: Path):
+    one = "date,A,B\n" + rows(ISO, [["1", "2"]] * 4)
+    for between in ("\nSecond table\n", "", "Total: 4\n"):
+        other = "date,A,B,C\n" + rows(ISO, [["3", "4", "5"]] * 4)
+        refusal(write(tmp_path, one + between + other))
+
+
+def test_rows_below_a_blank_line_are_no_other_table(tmp_path: Path):
+    first, *others = [f"{day:%b %d, %Y}" for day in DAYS]
+    text = f'Title\ndate,A,B\n"{first}",1,2\n\n' + "".join(f'"{d}",1,2\n' for d in others)
+    assert len(load(write(tmp_path, text))) == 4
+    for wrong in ("", "2024-06-31"):
+        text = f"Title\ndate,A,B\n{rows(ISO, [['1', '2']] * 4)}\n{wrong},1,2\n"
+        assert "date" in refusal(write(tmp_path, text))
+
+
+def test_days_of_two_digit_years_are_no_months(tmp_path: Path):
+    """The first trading days of 13 months: 200102 would be a month of 2001."""
+    stamps = ["200102", "200203", "200302", "200401", "200501", "200601", "200701", "200803",
+              "200901", "201001", "201102", "201201", "210104"]  # fmt: skip
+    text = "date,A,B\n" + rows(stamps, [["1", "2"]] * len(stamps))
+    assert "is not a date" in refusal(write(tmp_path, text))
+
+
+def test_a_percent_sign_of_a_feature_is_no_return(tmp_path: Path):
+    text = "date,A,B,yield\n" + rows(ISO, [["1", "2", "4.5%"]] * 4)
+    with pytest.raises(QfolioError, match=r"'4\.5%' has a percent sign") as raised:
+        load(write(tmp_path, text), features="yield")
+    assert "--returns" not in str(raised.value)

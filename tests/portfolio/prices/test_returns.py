@@ -111,6 +111,15 @@ def test_a_unit_that_is_unlikely():
         load(rates, returns="log")
 
 
+def test_percentages_near_1_of_a_fund_that_never_loses():
+    rng = np.random.default_rng(0)
+    months = pd.date_range("2015-01-31", periods=60, freq="ME")
+    table = pd.DataFrame(rng.uniform(0.75, 1.25, (60, 1)), index=months, columns=["CDI"])
+    assert "price relatives" in str(findings(table, "warning", returns="percent"))
+    back = load(table, returns="percent")
+    np.testing.assert_allclose(back.relatives[:, 0], 1 + table["CDI"].to_numpy()[1:] / 100)
+
+
 def test_relatives_are_told_from_prices():
     """As prices they would revert to 1, and be bought below it at a profit."""
     table = prices()

@@ -121,7 +121,8 @@ class Following:
         said += [self._retrain(), *([self.note] if self.note else [])]
         if live.differences:
             last = live.differences[-1]
-            total, most = (figure(x, "+,.2f") for x in (live.flows.sum(), last.money))
+            total = figure(sum(found.total for found in live.differences), "+,.2f")
+            most = figure(last.money, "+,.2f")
             said.append(
                 f"Holdings differed from those expected {amount(len(live.differences), 'time')}, "
                 f"by {total} in all (deposits, other fills); this is not counted as a return. The "

@@ -24,6 +24,7 @@ class Difference:
     date: str  # of the allocation
     where: str  # the asset that differs most in value, or cash
     money: float  # by which it does
+    total: float  # by which all assets and cash do
     unfilled: str | None
 
 
@@ -179,7 +180,8 @@ class _Account:
         before, units = self._taken
         same = np.allclose(given, units, rtol=1e-6) and not np.allclose(self.units, units)
         where = ("cash", *record.assets)[most]
-        return [Difference(record.date, where, float(off[most]), before.date if same else None)]
+        money, total = float(off[most]), float(off.sum())
+        return [Difference(record.date, where, money, total, before.date if same else None)]
 
     def take(self, record: Record, fill: int, row: int) -> float:
         """Takes an allocation's holdings and orders; returns the wealth of these holdings.

@@ -122,8 +122,8 @@ def aged(table: Prices, age: datetime.timedelta) -> list[str]:
     if usual >= 1 or age <= datetime.timedelta(days=2 * usual):
         return []
     return [
-        f"The latest prices, of {day(table.dates[-1])}, are {duration(age)} old; the orders are "
-        "made at them."
+        f"The latest prices, of {day(table.dates[-1])}, are {duration(age)} old if their times are "
+        "in UTC; the orders are made at them."
     ]
 
 
@@ -133,6 +133,9 @@ def not_traded(allocation: Allocation, earlier: Sequence[Record]) -> list[str]:
     They are not, if they are also those of a later record, or the same, after its trades.
     """
     for record in reversed(earlier):
+        after = np.add(record.shares, record.trades)
+        if any(record.trades) and np.allclose(allocation.shares, after, rtol=1e-9, atol=1e-5):
+            break
         # Cash may have earned interest since, or paid a fee; alone, it tells how much there is.
         before = np.allclose(allocation.shares, record.shares, rtol=1e-9, atol=1e-5)
         if not any(record.shares):
@@ -142,9 +145,6 @@ def not_traded(allocation: Allocation, earlier: Sequence[Record]) -> list[str]:
                 f"The holdings are those of record {record.number} before its trades; if "
                 "these were filled, export the holdings again."
             ]
-        after = np.add(record.shares, record.trades)
-        if np.allclose(allocation.shares, after, rtol=1e-9, atol=1e-5):
-            break
     return []
 
 

@@ -1,6 +1,7 @@
 """Finds the columns of a table that hold dates, assets, prices and features."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -8,15 +9,17 @@ import numpy as np
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.bars import columns_of_kind, pick_prices
 from qfolio.portfolio.prices.cells import is_missing, is_number, numbers
-from qfolio.portfolio.prices.dates import are_times, read_dates, readable_date
+from qfolio.portfolio.prices.dates import are_times, read_dates, readable_date, with_times
 from qfolio.portfolio.prices.findings import LISTED, Findings, listing
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.vocabulary import (
     ADJUSTED_NAMES,
     ASSET_NAMES,
     DATE_NAMES,
+    NAV_NAMES,
     PRICE_NAMES,
     RETURN_NAMES,
+    kind,
     plain,
 )
 
@@ -101,7 +104,7 @@ def find_columns(
     if label is not None and price is not None:
         own = tuple(Feature((single[name],), name not in shared) for name in features)
         return Columns(when, time, label, (), (price,), own)
-    _check_wide(table, others, when, findings)
+    _check_wide(table, others, when, time, findings)
     if findings.bad:
         return None
     assets, prices = pick_prices(table, others, findings)
@@ -208,8 +211,8 @@ def _long_columns(
     """
     names = {j: plain(table.names[j]) for j in columns}
     assets = [j for j in columns if names[j] in ASSET_NAMES]
-    order = [ADJUSTED_NAMES, PRICE_NAMES]
-    order.insert(0 if returns else 2, RETURN_NAMES)
+    order = [ADJUSTED_NAMES, PRICE_NAMES, NAV_NAMES]
+    order.insert(0 if returns else 3, RETURN_NAMES)
     prices = next(filter(None, ([j for j in columns if names[j] in each] for each in order)), [])
     if not assets or not prices:
         return None, None
@@ -247,8 +250,16 @@ def _are_labels(cells: np.ndarray) -> bool:
     return bool((values == np.rint(values)).all()) and 0 < different <= max(1, len(values) // 10)
 
 
-def _check_wide(table: Table, columns: list[int], when: int, findings: Findings) -> None:
+def _check_wide(
+    table: Table, columns: list[int], when: int, time: int | None, findings: Findings
+) -> None:
     """Finds columns without a name, and names of assets, which only a long table has."""
+
+    @cache
+    def repeats() -> bool:
+        dates = table.columns[when]
+        return _repeats(dates if time is None else with_times(dates, table.columns[time]))
+
     for j in columns:
         if not table.names[j]:
             findings.error(f"column {j + 1} has no name", advice="Name it or remove it.")
@@ -260,7 +271,7 @@ def _check_wide(table: Table, columns: list[int], when: int, findings: Findings)
                 column=table.names[j],
                 advice="Name the column of prices 'price'.",
             )
-        elif _repeats(table.columns[when]):
+        elif kind(table.names[j]) is None and repeats():  # a volume of 1.2M is no name
             findings.error(
                 "holds names, and dates repeat, as in a table with a row for each date and asset",
                 column=table.names[j],

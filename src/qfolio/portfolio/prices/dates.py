@@ -187,7 +187,8 @@ def _seconds(count: float, unit: Unit) -> int:
 def _of_months(counts: np.ndarray) -> list[datetime | str]:
     """The first days of months such as 202001; empty if a column holds anything else.
 
-    It must have more rows than a year has months, and several months: 200112 may be a day of 2020.
+    It must have more rows than a year has months, most of them at most a quarter apart: 200112 may
+    be a day of 2020.
     """
     known = counts[~np.isnan(counts)]
     years, months = np.divmod(known, 100)
@@ -195,7 +196,7 @@ def _of_months(counts: np.ndarray) -> list[datetime | str]:
         len(known) <= 12
         or not np.isin(years, YEARS).all()
         or not np.isin(months, range(1, 13)).all()
-        or (months == months[0]).all()
+        or np.median(np.diff(np.sort(12 * years + months))) > 3
     ):
         return []
     return [
@@ -297,7 +298,7 @@ def _read_moment(cell: Any, order: str | None) -> datetime | str | None:
 
 
 def _zone(text: str | None) -> timezone | None:
-    if text is None or text in ("Z", "UTC"):
+    if text is None or text.upper() in ("Z", "UTC"):
         return UTC if text else None
     offset = timedelta(hours=int(text[1:3]), minutes=int(text[-2:]))
     return timezone(-offset if text[0] == "-" else offset)

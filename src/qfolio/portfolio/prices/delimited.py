@@ -14,7 +14,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
 from qfolio.portfolio.prices.cells import MISSING, has_decimal
 from qfolio.portfolio.prices.dates import begins_row
-from qfolio.portfolio.prices.header import Header, parse_header
+from qfolio.portfolio.prices.header import Header, has_numbers, parse_header
 from qfolio.portfolio.prices.layout import Table
 
 SEPARATORS = ",;\t|"
@@ -86,13 +86,15 @@ def _with_decimals(text: str, name: str, layout: "_Layout", plain: set[int]) -> 
 
 
 def _first_table(text: str, layout: "_Layout") -> tuple[str, str]:
-    """The text up to a blank line with something else than a row below, and what is left out."""
+    """The text up to a blank line with words below, and what is left out."""
     lines = list(io.StringIO(text, newline=""))
     filled = [k for k, line in enumerate(lines) if line.strip(f"{layout.separator} \t\r\n")]
     left_out = f"the lines above row {layout.before} are left out"
     for last, after in itertools.pairwise(filled):
-        first = lines[after].split(layout.separator)[0].strip('" \r\n')
-        if last >= layout.before and after > last + 1 and not begins_row(first):
+        if last < layout.before or after == last + 1:
+            continue
+        (cells,) = csv.reader([lines[after]], delimiter=layout.separator)
+        if not begins_row(cells[0].strip()) and not has_numbers(cells[1:]):
             rest = quote(lines[after].strip(), 60)
             left_out += f", and so is what follows the blank row {last + 2}: {rest} …"
             return "".join(lines[: last + 1]), left_out

@@ -104,11 +104,14 @@ def _below_settings(records: list[list[str]]) -> Header | None:
 def _below_text(records: list[list[str]]) -> Header | None:
     """The header below lines of text; None if it is the first record, or cannot be told.
 
-    It is a record of words above a row of numbers. The record above it has another number of cells,
-    or only the first of them, as spreadsheets write a title; else either could hold the names.
+    It is a record of words above the first row of numbers. The record above it has another number
+    of cells, or only the first of them, as spreadsheets write a title; else either could hold the
+    names.
     """
     filled = [(k, record) for k, record in enumerate(records) if any(record)]
     for (_, above), (k, record), (_, below) in zip(filled, filled[1:], filled[2:], strict=False):
+        if _is_row(above):
+            return None
         last = max((j for j, name in enumerate(record) if name), default=0)
         if (
             (len(above) != len(record) or not any(above[1:]))
@@ -117,12 +120,21 @@ def _below_text(records: list[list[str]]) -> Header | None:
             and all(record[1:last])
             and not any(map(_is_value, record))
             and (not record[0] or not is_missing(record[0]))
-            and begins_row(below[0])
-            and any(is_number(cell) or is_number(cell, ",") for cell in below[1:])
+            and _is_row(below)
         ):
             names = record[0] or "date", *record[1:]
             return name_columns(names)._replace(lines=k + 1, below_text=True)
     return None
+
+
+def _is_row(record: list[str]) -> bool:
+    """Whether a record begins with a date, and has a number."""
+    return begins_row(record[0]) and has_numbers(record[1:])
+
+
+def has_numbers(cells: list[str]) -> bool:
+    """Whether one of some cells is a number, with either decimal mark."""
+    return any(is_number(cell) or is_number(cell, ",") for cell in cells)
 
 
 def _setting(record: list[str]) -> str:

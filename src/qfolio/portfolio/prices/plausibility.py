@@ -82,8 +82,9 @@ def check_cells(grid: Grid, findings: Findings) -> None:
 def _complaint(grid: Grid, block: Block, i: int, j: int) -> str:
     cell = grid.table.columns[block.columns[j]][int(grid.lines[i, j])]
     said = not_a_number(cell, grid.table.decimal)
-    only = ", which is read with returns='percent' (--returns) only"
-    return said + only if said.endswith("percent sign") else said
+    if block is grid.prices and said.endswith("percent sign"):
+        return f"{said}; if it is a return, choose returns='percent' (--returns)"
+    return said
 
 
 def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:

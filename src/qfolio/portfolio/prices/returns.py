@@ -23,6 +23,7 @@ SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
 FEWEST = 20  # rows that tell what their numbers are
 GAIN = (0.008, 0.05)  # usual gain of a row without any loss that is doubtful, and impossible
 DOUBTFUL, CLEAR, MOST = 0.0005, 0.003, 0.2  # how far usual relatives, or prices near 1, are from 1
+DEPOSIT = 0.05  # monthly percentages of funds that never lose are further from 1
 RELATIVES = (
     "the numbers look like price relatives, new price over old: they are near 1, and as often "
     "above as below"
@@ -49,16 +50,19 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid | None:
         rates = (block.values - zero) * one
         known = np.isfinite(rates)
         moved = rates[known & (rates != 0)]
-        if unit != "relative" and usual_relative(block.values) >= CLEAR:
+        near = 0.0 if unit == "relative" else usual_relative(block.values)
+        if CLEAR <= near <= (DEPOSIT if unit == "percent" else MOST):
             findings.error(RELATIVES, advice="Choose returns='relative' (--returns).")
             return None
+        if near > DEPOSIT:
+            findings.warn(RELATIVES, advice="If so, choose returns='relative' (--returns).")
         lossless = len(rates) >= FEWEST and moved.size and (moved > 0).all()
         gain = float(np.median(moved)) if lossless else 0.0
         if gain >= GAIN[0]:
             report = findings.error if gain >= GAIN[1] else findings.warn
             report(
                 "the numbers look like prices, not returns: none is a loss, and the usual gain is "
-                f"{100 * gain:.2g}%",
+                f"{100 * gain:{',.0f' if gain > 1 else '.2g'}}%",
                 advice="If they are prices, leave out returns (--returns).",
             )
             if gain >= GAIN[1]:

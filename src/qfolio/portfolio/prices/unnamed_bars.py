@@ -13,7 +13,7 @@ from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Grid
 
 MOST = 50  # assets of a table in which bars are looked for
-FEWEST = 50  # rows
+FEWEST, ENOUGH = 50, 5000  # rows, of which the last are looked at
 NEAR = 0.2  # in log: how far the high usually is from the others at most
 NEARLY_ALL = 0.99  # of the rows, on which the high is above and the low below
 OFTEN = 0.2  # of the rows, on which the open is above the close, and below it
@@ -32,7 +32,7 @@ def check_unnamed_bars(grid: Grid, rest: Rest, findings: Findings) -> None:
     if not 4 <= count <= MOST or len(rest.values) < FEWEST:
         return
     with np.errstate(invalid="ignore", divide="ignore"):
-        logs = np.log(rest.values)
+        logs = np.log(values := rest.values[-ENOUGH:])
     known = np.isfinite(logs)
     above = np.array([_share(logs[:, [i]] >= logs, known[:, [i]] & known) for i in range(count)])
     for high, low in np.argwhere(above >= NEARLY_ALL).tolist():
@@ -42,7 +42,7 @@ def check_unnamed_bars(grid: Grid, rest: Rest, findings: Findings) -> None:
         within = [j for j in np.flatnonzero(between).tolist() if j not in (high, low)]
         pairs = itertools.combinations(within, 2)
         crossing = any(OFTEN <= above[pair] <= 1 - OFTEN for pair in pairs)
-        inner, ends = rest.values[:, within], rest.values[:, [high, low]]
+        inner, ends = values[:, within], values[:, [high, low]]
         touches = int((inner[..., None] == ends[:, None]).any(axis=(1, 2)).sum())
         if crossing and touches >= max(3, TOUCHING * len(logs)):
             names = [grid.assets[rest.assets[j]] for j in sorted({high, low, *within})]

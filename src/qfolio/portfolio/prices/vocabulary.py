@@ -7,7 +7,8 @@ ASSET_NAMES = ("asset", "ticker", "tic", "symbol", "name", "instrument")
 SHARES_NAMES = ("shares", "quantity", "qty", "units", "position")
 CASH = "cash"
 ADJUSTED_NAMES = ("adjusted close", "adj close", "adjclose", "adjusted price", "adj price")
-PRICE_NAMES = ("close", "price", "value", "nav")
+PRICE_NAMES = ("close", "price", "value")
+NAV_NAMES = ("nav",)  # of a fund that is traded, it stands beside the price
 RETURN_NAMES = ("return", "returns", "ret", "net return", "net returns", "daily return")
 RATE_NAMES = (
     "rate", "rates", "yield", "yields", "riskfree", "risk free", "tbill", "tbills", "t bill",

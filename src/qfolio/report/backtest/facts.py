@@ -144,7 +144,9 @@ def _calendar(calendar: str, unit: str) -> str:
             f"of cash included, is more than {100 * width:.4g}% of the wealth from the weight "
             "held; otherwise, holdings drift."
         )
-    if calendar.isdecimal():
+    if calendar == "daily" and unit == "day":
+        when = "every day"
+    elif calendar.isdecimal():
         when = f"once in {amount(int(calendar), unit)}, counted from the table’s first row"
     else:
         when = f"on the first {unit} of each {PERIODS[calendar]}"
