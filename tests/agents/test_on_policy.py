@@ -12,7 +12,7 @@ from equinox import filter_jit as jit
 from scipy import stats
 
 from qfolio.agents.a2c import A2C
-from qfolio.agents.on_policy import Batch, explained_variance, standardized
+from qfolio.agents.on_policy import Batch, OnPolicy, explained_variance, standardized
 from qfolio.agents.ppo import PPO, clipped, shuffled
 from qfolio.agents.reinforce import REINFORCE
 from qfolio.core.errors import QfolioError
@@ -175,7 +175,7 @@ def test_normalized_by_hand():
 class Looking(PPO):
     """Learns nothing; reports of which rows its minibatches are."""
 
-    def judge(self, task, weights, rollout, gae_lambda):
+    def judge(self, task, weights, rollout):
         row = jnp.arange(8.0)
         return Batch(row[:, None], row, row, row, row)
 
@@ -264,7 +264,7 @@ def test_loss_and_gradient(name, kind, changes):
         task = TASKS[kind]
         state = jit(agent.init)(task, jax.random.key(0))
         rollout = a_rollout(agent, task, state, jax.random.key(1))
-        batch = jit(agent.judge)(task, state.weights, rollout, 0.8)
+        batch = jit(OnPolicy.judge)(agent, task, state.weights, rollout)
         # Some way from the policy that drew the actions, so that some ratios are clipped.
         leaves, structure = jax.tree.flatten(state.weights)
         noise = [
@@ -295,7 +295,7 @@ def test_the_critic_is_no_part_of_the_policys_gradient():
     task = TASKS["numbers"]
     state = jit(agent.init)(task, jax.random.key(0))
     rollout = a_rollout(agent, task, state, jax.random.key(1))
-    loss = lambda weights: agent.loss(weights, agent.judge(task, state.weights, rollout, 1.0))[0]  # noqa: E731
+    loss = lambda weights: agent.loss(weights, agent.judge(task, state.weights, rollout))[0]  # noqa: E731
     gradient = jax.tree.map(np.asarray, jax.jit(jax.grad(loss))(state.weights))
     assert all((x == 0).all() for x in jax.tree.leaves(gradient.critic))
     assert all((x != 0).any() for x in (gradient.actor.mlp.weights[-1], gradient.log_std))
@@ -331,7 +331,7 @@ def test_judging_is_what_the_formulas_say():
     agent = dataclasses.replace(agent, reward_scale=0.5)
     state = jit(agent.init)(task, jax.random.key(0))
     rollout = a_rollout(agent, task, state, jax.random.key(1))
-    batch = jit(agent.judge)(task, state.weights, rollout, 0.8)
+    batch = jit(agent.judge)(task, state.weights, rollout)
     values = jit(lambda x: jax.vmap(state.weights.value)(x))
     value = np.asarray(values(rollout.observation))
     following = np.asarray(values(rollout.next_observation))

@@ -5,11 +5,8 @@ log probabilities times their advantages, and the critic takes one towards the r
 docs/algorithms/policy_gradients.md has the formulas and the deviations from the paper.
 """
 
-from jaxtyping import PRNGKeyArray
-
-from qfolio.agents.on_policy import OnPolicy, OnPolicyState, explained_variance
+from qfolio.agents.on_policy import OnPolicy
 from qfolio.core.fields import number, require, static
-from qfolio.core.mdp import Metrics, Task, Transition
 
 
 class A2C(OnPolicy):
@@ -22,10 +19,3 @@ class A2C(OnPolicy):
 
     def __check_init__(self) -> None:
         require(self, "gae_lambda", lambda x: 0 <= x <= 1, "between 0 and 1")
-
-    def improve(
-        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[OnPolicyState, Metrics]:
-        batch = self.judge(task, state.weights, rollout, self.gae_lambda)
-        state, metrics = self.descend(task, state, batch)
-        return state, metrics | {"explained_variance": explained_variance(batch)}

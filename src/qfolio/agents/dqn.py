@@ -148,7 +148,7 @@ class DQN(Agent):
                 "step; set train_freq=1 or persistence=0."
             )
         if self.all_actions:
-            hindsight.require_plain({name: getattr(self, name) for name in hindsight.PLAIN})
+            hindsight.require_plain(self)
         require_counts(self, "outcomes", 0)
         require(self, "bootstrap_heads", lambda x: 1 <= x <= 1000, "from 1 to 1,000")
         require(self, "caution", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")

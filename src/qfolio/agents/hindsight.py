@@ -5,7 +5,7 @@ exogenous inputs, Sinclair et al. 2023): the buffer stores moves instead of tran
 are drawn at each update, and all actions regress together.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.mdp import ExogenousTask, Position, Task, Transition
+from qfolio.core.mdp import Agent, ExogenousTask, Position, Task, Transition
 from qfolio.learning.targets import Scalar, bootstrap, td_target
 
 Q = Callable[[PyTree], Float[Array, "batch action"]]
@@ -42,10 +42,10 @@ PLAIN: dict[str, str | bool | int | float] = {
 """The values of an agent's settings that ``all_actions`` requires."""
 
 
-def require_plain(settings: Mapping[str, str | bool | int | float]) -> None:
-    """Raises QfolioError if one of an agent's settings differs from ``PLAIN``."""
+def require_plain(agent: Agent) -> None:
+    """Raises QfolioError if one of the agent's settings differs from ``PLAIN``."""
     for name, value in PLAIN.items():
-        if settings[name] != value:
+        if getattr(agent, name) != value:
             raise QfolioError(
                 "all_actions learns expected values from single moves, drawn uniformly, without "
                 f"exploration; set {name}={str(value).lower()}, or all_actions=false."

@@ -6,7 +6,6 @@ actions that did better, and the estimate moves towards the returns. ``reinforce
 and ``ppo.py`` differ in how. docs/algorithms/policy_gradients.md has the formulas.
 """
 
-import abc
 import dataclasses
 from functools import partial
 from typing import NamedTuple
@@ -25,7 +24,7 @@ from qfolio.learning.networks import Network, NetworkConfig, Outputs, outputs_of
 from qfolio.learning.normalization import Moments, NormalizationConfig, Normalizer, normalized
 from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.recall import recalled, stored
-from qfolio.learning.targets import Scalar, advantages
+from qfolio.learning.targets import advantages
 
 LARGEST = 1e18
 """Bound of metrics; a metric that is not finite would count as a failure of training."""
@@ -73,7 +72,7 @@ class Batch(NamedTuple):
 
 
 class OnPolicy(Agent):
-    """Acting, the networks and the optimizer's step; subclasses define ``improve``."""
+    """Acting, the networks and the optimizer's step; subclasses differ in how they learn."""
 
     network: str = static("flat")  # flat, or a kind of docs/concepts/networks.md
     hidden: tuple[int, ...] = sizes(64, 64)  # units of each hidden layer of actor and critic
@@ -107,6 +106,7 @@ class OnPolicy(Agent):
     _optimizer = Group(OptimizerConfig)
 
     least_length = 1  # of a rollout
+    gae_lambda = 1.0  # λ of the advantages, a setting of some
 
     def __check_init__(self) -> None:
         require_counts(self, "rollout_length", self.least_length)
@@ -167,19 +167,22 @@ class OnPolicy(Agent):
         state, metrics = self.improve(task, state, rollout, key)
         return dataclasses.replace(state, normalizer=after), metrics
 
-    @abc.abstractmethod
     def improve(
         self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
         """Learns from a rollout of normalized observations, as stored, and rewards."""
+        batch = self.judge(task, state.weights, rollout)
+        state, metrics = self.practise(task, state, batch, key)
+        return state, metrics | {"explained_variance": explained_variance(batch)}
 
-    def judge(
-        self, task: Task, weights: PolicyAndValue, rollout: Transition, gae_lambda: Scalar
-    ) -> Batch:
-        """The steps of a rollout that these weights made, with advantages and targets.
+    def practise(
+        self, task: Task, state: OnPolicyState, batch: Batch, key: PRNGKeyArray
+    ) -> tuple[OnPolicyState, Metrics]:
+        """Learns from the steps of a rollout; by default with one gradient step."""
+        return self.descend(task, state, batch)
 
-        gae_lambda: λ of the advantages, from 0 (trust the critic) to 1 (trust the rewards).
-        """
+    def judge(self, task: Task, weights: PolicyAndValue, rollout: Transition) -> Batch:
+        """The steps of a rollout that these weights made, with advantages and targets."""
 
         def look(step: Transition) -> tuple[Array, Array, Array]:
             seen = recalled(task, step.observation)
@@ -196,7 +199,7 @@ class OnPolicy(Agent):
             terminated = terminated | truncated
         advantage = advantages(
             self.reward_scale * rollout.reward, value, following, terminated, truncated,
-            self.discount, gae_lambda,
+            self.discount, self.gae_lambda,
         )  # fmt: skip
         return Batch(
             observation=step.observation,

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, explained_variance
+from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, require_counts, static
-from qfolio.core.mdp import Metrics, Task, Transition
+from qfolio.core.mdp import Metrics, Task
 from qfolio.learning.targets import Scalar
 
 
@@ -51,11 +51,9 @@ class PPO(OnPolicy):
         clipped = jnp.abs(ratio - 1) > self.clip_range
         return {"kl": (ratio - 1 - log_ratio).mean(), "clip_fraction": clipped.mean()}
 
-    def improve(
-        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+    def practise(
+        self, task: Task, state: OnPolicyState, batch: Batch, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        batch = self.judge(task, state.weights, rollout, self.gae_lambda)
-
         def epoch(state: OnPolicyState, key: PRNGKeyArray) -> tuple[OnPolicyState, Metrics]:
             # Minibatches are gathered one at a time; gathered beforehand, each is copied twice.
             def descend(state: OnPolicyState, rows: Array) -> tuple[OnPolicyState, Metrics]:
@@ -65,8 +63,7 @@ class PPO(OnPolicy):
             return lax.scan(descend, state, order.reshape(-1, self.batch_size))
 
         state, metrics = lax.scan(epoch, state, jax.random.split(key, self.epochs))
-        metrics = jax.tree.map(jnp.mean, metrics)
-        return state, metrics | {"explained_variance": explained_variance(batch)}
+        return state, jax.tree.map(jnp.mean, metrics)
 
 
 def shuffled(key: PRNGKeyArray, n: int) -> Int[Array, " n"]:

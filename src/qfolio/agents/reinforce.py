@@ -13,10 +13,10 @@ import dataclasses
 from jax import lax
 from jaxtyping import Array, Bool, PRNGKeyArray
 
-from qfolio.agents.on_policy import OnPolicy, OnPolicyState, explained_variance
+from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, PolicyAndValue
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import static
-from qfolio.core.mdp import Metrics, Task, Transition
+from qfolio.core.mdp import Task, Transition
 from qfolio.core.training import episode_steps
 
 
@@ -45,13 +45,9 @@ class REINFORCE(OnPolicy):
             )
         return super().init(task, key)
 
-    def improve(
-        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[OnPolicyState, Metrics]:
-        batch = self.judge(task, state.weights, rollout, gae_lambda=1.0)
-        batch = batch._replace(counted=finished(rollout).reshape(-1))
-        state, metrics = self.descend(task, state, batch)
-        return state, metrics | {"explained_variance": explained_variance(batch)}
+    def judge(self, task: Task, weights: PolicyAndValue, rollout: Transition) -> Batch:
+        batch = super().judge(task, weights, rollout)
+        return batch._replace(counted=finished(rollout).reshape(-1))
 
 
 def finished(rollout: Transition) -> Bool[Array, "time environment"]:

@@ -18,7 +18,7 @@ from qfolio.commands.arguments import (
     prepare,
     typed,
 )
-from qfolio.commands.parsing import PAGE, Document, outcome
+from qfolio.commands.parsing import Document, outcome
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import again
@@ -184,13 +184,11 @@ def _train(run: "Comparison", executor: "Executor") -> None:
 
 
 def _finish(run: "Comparison") -> Document:
-    from qfolio.commands import console
     from qfolio.report.comparison import write_comparison_report
 
     content = run.finish()
     write_comparison_report(run.folder, content)
     _print_ranking(content)
-    console.say(f"Report: {run.folder / PAGE}")
     return content
 
 

@@ -17,7 +17,7 @@ from qfolio.commands.arguments import (
     prepare,
     typed,
 )
-from qfolio.commands.parsing import PAGE, Document, outcome
+from qfolio.commands.parsing import Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import again
@@ -104,7 +104,6 @@ def continual(
         write_continual_report(folder, content)
     _print_ways(content)
     console.tell(verdict(content))
-    console.say(f"Report: {folder / PAGE}")
     return outcome(folder, content)
 
 

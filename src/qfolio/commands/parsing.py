@@ -189,7 +189,10 @@ def example(command: Callable[..., Any]) -> list[str]:
 
 
 def outcome(folder: Path, content: Document) -> Document:
-    """The document of a command that has written a report to a folder."""
+    """Says where a command has written its report, and returns the command's document."""
+    from qfolio.commands.console import say
+
+    say(f"Report: {folder / PAGE}")
     return {"folder": folder, "report": folder / PAGE, **content}
 
 

@@ -6,7 +6,7 @@ from tyro.conf import Positional
 
 from qfolio.commands.arguments import File, Name, prepare
 from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points
-from qfolio.commands.parsing import PAGE, Document, Failed, outcome
+from qfolio.commands.parsing import Document, Failed, outcome
 from qfolio.commands.tables import READING, Read
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import again
@@ -106,5 +106,4 @@ def backtest(
     for sentences in found.why.diagnosis.values():
         for sentence in sentences:
             console.tell(f"Diagnosis: {sentence}")
-    console.say(f"Report: {folder / PAGE}")
     return outcome(folder, read_json(folder / "summary.json"))

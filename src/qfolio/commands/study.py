@@ -9,7 +9,7 @@ from tyro.conf import Positional, arg
 
 from qfolio.commands.arguments import prepare
 from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points
-from qfolio.commands.parsing import PAGE, Document, outcome
+from qfolio.commands.parsing import Document, outcome
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import again
 
@@ -98,7 +98,6 @@ def study(
         result = run.result()
         write_study_report(run)
     print_study(result)
-    console.say(f"Report: {run.folder / PAGE}")
     return outcome(run.folder, msgspec.to_builtins(result))
 
 

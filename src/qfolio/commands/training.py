@@ -21,7 +21,7 @@ from qfolio.commands.arguments import (
     prepare,
     training_command,
 )
-from qfolio.commands.parsing import PAGE, Document, outcome
+from qfolio.commands.parsing import Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError, require_whole
 from qfolio.core.registry import again
@@ -357,7 +357,6 @@ def _finish(run: "Run", contrast: "Run | None") -> Document:
         f"training ({summary['steps_per_second']:,.0f} a second), "
         f"{summary['seconds_compile']:.1f} s of compiling."
     )
-    say(f"Report: {folder / PAGE}")
     return outcome(folder, summary)
 
 

@@ -19,7 +19,7 @@ from qfolio.commands.arguments import (
     prepare,
     training_command,
 )
-from qfolio.commands.parsing import PAGE, Document, outcome
+from qfolio.commands.parsing import Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError, needs
 from qfolio.core.registry import again
@@ -215,7 +215,6 @@ def _conclude(work: "Tuning", resume: str, executor: "Executor") -> Document:
         write_tuning_report(work.folder, data)
     print_search(summary, data.verdicts)
     say("", "This trains the best configuration of the search:", train)
-    say(f"Report: {work.folder / PAGE}")
     return summary
 
 

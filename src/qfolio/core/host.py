@@ -221,9 +221,7 @@ class HostPopulation(Population):
         self._own = [jax.device_put([x[i] for x in own]) for i in range(len(self.seeds))]
         self._shared = shared
         self._states = [
-            self._start(
-                "begin", lambda task, agent, seed: begin(task, agent, seed), seed, own, once=True
-            )
+            self._start("begin", begin, seed, own, once=True)
             for seed, own in zip(np.array(self.seeds, np.uint32), self._own, strict=True)
         ]
         self._environments: list[Environments] = []

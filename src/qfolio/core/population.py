@@ -83,9 +83,7 @@ class Population:
         self._programs = programs_of((form, self._members.form, rows))
         self._require_memory()
         seeds = self._members.place(np.array(self.seeds, np.uint32))
-        self._states: list[TrainingState] = self._run(
-            "begin", lambda task, agent, seed: begin(task, agent, seed), seeds, once=True
-        )
+        self._states: list[TrainingState] = self._run("begin", begin, seeds, once=True)
 
     @property
     def steps(self) -> int:

@@ -149,11 +149,6 @@ def of(family: str, names: Iterable[str] = tuple(TASKS)) -> list[str]:
     return [name for name in names if name.startswith(f"{family}/")]
 
 
-def is_known(kind: Kind, name: str) -> bool:
-    """Whether qfolio or an installed package defines this name."""
-    return _where(kind, name) is not None
-
-
 def find(kind: Kind, name: str) -> type[Any]:
     """The class that a user names; imports its module, also from the current directory.
 
@@ -236,7 +231,7 @@ def short(name: str) -> str:
 def parted(entry: str) -> tuple[str, str]:
     """The agent and the preset of an entry such as dqn:fast or module:Name:fast; "" without one."""
     parts = entry.split(":")
-    count = 1 if is_known("agent", parts[0]) else 2
+    count = 2 if _where("agent", parts[0]) is None else 1
     return ":".join(parts[:count]), ":".join(parts[count:])
 
 

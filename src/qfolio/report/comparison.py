@@ -287,7 +287,7 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
     ranking, results = data.ranking, data.results
     first = ranking["order"][0]
     optimum = next(iter(results.values())).optimum
-    near = f"{percent(HEADLINE, 0)}"
+    near = percent(HEADLINE, 0)
     facts = [("Agents", str(len(results)), f"{amount(ranking['seeds'], 'seed')} each")]
     if data.graded and optimum is not None:
         facts.append(

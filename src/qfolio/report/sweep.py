@@ -71,7 +71,7 @@ class Sweep:
         if len(gains) == 1:
             return f"{says}; a single seed allows no further conclusion."
         interval = mean_interval(gains)
-        gap = f"{number(gains.mean(), digits, sign=True)}"
+        gap = number(gains.mean(), digits, sign=True)
         spread = over_seeds(gains, interval, lambda gain: number(gain, digits, sign=True))
         if interval is None:
             return f"{says} ({gap}; {spread}): too few seeds for a verdict."

@@ -137,7 +137,7 @@ class GridOptimum:
         except (OSError, TypeError):  # a class of a notebook: nothing tells whether it has changed
             return {key: np.asarray(array) for key, array in compute().items()}
         parts += [Path(source).read_bytes() for source in sources if source]
-        path = cache_directory() / "optimum" / f"{hashlib.sha256(b'|'.join(parts)).hexdigest()}"
+        path = cache_directory() / "optimum" / hashlib.sha256(b"|".join(parts)).hexdigest()
         try:
             return read_arrays(path)
         except QfolioError:  # not solved yet, or damaged

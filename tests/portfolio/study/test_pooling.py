@@ -32,10 +32,10 @@ def constant(active, count=40):
 
 
 def test_stouffer_by_hand():
-    assert stouffer([1, 2], [1, 1]) == pytest.approx(3 / math.sqrt(2))
-    assert stouffer([1, 2], [1, 2]) == pytest.approx(5 / math.sqrt(5))
+    assert stouffer([1, 2], [1, 1], np.eye(2)) == pytest.approx(3 / math.sqrt(2))
+    assert stouffer([1, 2], [1, 2], np.eye(2)) == pytest.approx(5 / math.sqrt(5))
     assert stouffer([1, 2], [1, 1], np.ones((2, 2))) == pytest.approx(1.5)  # one table, twice
-    assert stouffer([1.7], [3]) == pytest.approx(1.7)
+    assert stouffer([1.7], [3], [[1]]) == pytest.approx(1.7)
 
 
 def test_p_values_by_hand():

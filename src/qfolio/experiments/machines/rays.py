@@ -64,7 +64,7 @@ class Ray:
         self.workers, self.cpus = room if workers is None else workers, cpus
         self.waits = workers is not None  # for machines that join later
         if self.workers < 1:
-            what = "GPU" if self.lockstep else f"node with {_cores(cpus)}"
+            what = "GPU" if self.lockstep else f"node with {amount(cpus, 'core')}"
             raise QfolioError(
                 f"The Ray cluster has no {what}, so no worker can start; add one, or in Python use "
                 "Ray(workers=…), which waits for it."
@@ -154,7 +154,7 @@ class _Actors:
         what = {"GPU": "GPUs", "CPU": "cores"}[kind]
         free = int(self._ray.available_resources().get(kind, 0))
         there = int(self._ray.cluster_resources().get(kind, 0))
-        asked = "a GPU" if self._executor.lockstep else _cores(self._executor.cpus)
+        asked = "a GPU" if self._executor.lockstep else amount(self._executor.cpus, "core")
         return QfolioError(
             f"No worker got a place within {PLACE:.0f} seconds: each asks for {asked}, and of the "
             f"Ray cluster's {there} {what} {free} are free; end what else runs there, or add a "
@@ -207,10 +207,6 @@ def _connect(ray: Any, address: str | None, more: int = 2) -> None:
         if not more or not failed:
             raise
         _connect(ray, address, more - 1)
-
-
-def _cores(count: int) -> str:
-    return amount(count, "core")
 
 
 def _reason(error: Exception) -> str:

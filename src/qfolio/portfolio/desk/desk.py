@@ -272,16 +272,7 @@ class Desk:
                 f"{hindsight}; give later prices, or add --anyway, which then records nothing."
             )
         spent = self.spent(followed, table)
-        allocation = Allocation.of(
-            followed,
-            table,
-            shares,
-            cash,
-            whole_shares=whole_shares,
-            spent=spent,
-            debts=self.debts,
-            lag=self.run.config.lag,
-        )
+        allocation = self._allocation(followed, table, shares, cash, whole_shares, spent)
         wanted = None
         if place is not None:
             wanted = place, *order_rows(allocation, layout, currency)
@@ -308,6 +299,16 @@ class Desk:
                 done += f" {wanted[0]} has {amount(len(wanted[-1]), 'order')}."
         said.append(done)
         return Allocated(allocation, standing, trained, table, spent, why, said, record)
+
+    def _allocation(
+        self, followed: Policy | Untrained, table: Prices, shares: np.ndarray, cash: float,
+        whole_shares: bool, spent: float,
+    ) -> Allocation:  # fmt: skip
+        """The allocation under the terms of the backtest."""
+        return Allocation.of(
+            followed, table, shares, cash, whole_shares=whole_shares, spent=spent,
+            debts=self.debts, lag=self.run.config.lag,
+        )  # fmt: skip
 
     def fill(self, name: str) -> int:
         """Rows over which orders are filled: those of the user's own strategies at once."""
@@ -451,16 +452,7 @@ class Desk:
                 "ledger; restore them."
             )
         spent = self.spent(followed, table, record.number)
-        remade = Allocation.of(
-            followed,
-            table,
-            shares,
-            cash,
-            whole_shares=record.whole_shares,
-            spent=spent,
-            debts=self.debts,
-            lag=self.run.config.lag,
-        )
+        remade = self._allocation(followed, table, shares, cash, record.whole_shares, spent)
         off = float(abs(remade.weights - np.array(record.target)).max())
         if off > SAME:
             raise QfolioError(

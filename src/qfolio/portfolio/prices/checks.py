@@ -72,8 +72,7 @@ class Choices:
     @property
     def series(self) -> dict[str, str]:
         """The files of those of ``columns`` that have one, by name."""
-        pairs = (text.split(SEPARATOR, 1) for text in self.columns if SEPARATOR in text)
-        return {name: file for name, file in pairs}
+        return dict(text.split(SEPARATOR, 1) for text in self.columns if SEPARATOR in text)
 
 
 def cells(table: Table, choices: Choices) -> tuple[Grid | None, Findings]:

@@ -164,7 +164,7 @@ def _pooled(
     )
 
 
-def stouffer(z: ArrayLike, weights: ArrayLike, correlation: ArrayLike | None = None) -> float:
+def stouffer(z: ArrayLike, weights: ArrayLike, correlation: ArrayLike) -> float:
     """Combine one-sided tests of several tables: Σ wz / √(w'Rw), standard normal without an edge.
 
     Stouffer et al. (1949), "The American Soldier", with the weights of Lipták (1958); R allows for
@@ -174,10 +174,9 @@ def stouffer(z: ArrayLike, weights: ArrayLike, correlation: ArrayLike | None = N
         z: Normal quantiles of shape (tables,).
         weights: Positive numbers of the same shape. √years has the most power if all tables have
             the same information ratio, because the expected z is that ratio times √years.
-        correlation: R of shape (tables, tables) (default: independent tables).
+        correlation: R of shape (tables, tables).
     """
-    scores, w = np.asarray(z, dtype=float), np.asarray(weights, dtype=float)
-    shared = np.eye(len(w)) if correlation is None else np.asarray(correlation, dtype=float)
+    scores, w, shared = (np.asarray(x, dtype=float) for x in (z, weights, correlation))
     return float(w @ scores / math.sqrt(w @ shared @ w))
 
 

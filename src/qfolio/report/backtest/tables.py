@@ -248,7 +248,7 @@ def luck_rows(names: list[str], data: BacktestData) -> list[dict[str, Any]]:
         active = entry.active_test
         # Probabilities are rounded down: 94.96 must not read as 95.0.
         certain, deflated, skilled = (
-            f"{percent(math.floor(1000 * p) / 1000)}" if math.isfinite(p) else "–"
+            percent(math.floor(1000 * p) / 1000) if math.isfinite(p) else "–"
             for p in (test.probabilistic, test.deflated, active.deflated if active else math.nan)
         )
         rows.append(
