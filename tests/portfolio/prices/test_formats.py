@@ -555,3 +555,17 @@ def test_a_percent_sign_of_a_feature_is_no_return(tmp_path: Path):
     with pytest.raises(QfolioError, match=r"'4\.5%' has a percent sign") as raised:
         load(write(tmp_path, text), features="yield")
     assert "--returns" not in str(raised.value)
+
+
+def test_lines_that_are_left_out_are_named_wherever_a_table_is_read(tmp_path: Path):
+    text = f"Title\ndate,A\n{rows(ISO, [['1']] * 4)}\nSource: vendor\n"
+    series = write(tmp_path, text)
+    table = pd.DataFrame({"A": [1.0, 2, 3, 4], "B": [1.0, 2, 3, 5]}, index=DAYS)
+    notes = map(str, findings(table, "note", columns=f"A={series}"))
+    assert any("the blank row 7: 'Source: vendor'" in each for each in notes)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for name in ("one", "two"):
+        (folder / f"{name}.csv").write_text(text.replace("A", name))
+    notes = map(str, findings(folder, "note"))
+    assert sum("the blank row 7" in each for each in notes) == 2

@@ -9,7 +9,7 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import amount, quote
-from qfolio.portfolio.prices.findings import Findings, day
+from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.grid import Grid, check_currencies
 from qfolio.portfolio.prices.reading import PARQUET_FILES, TEXT_FILES
 from qfolio.portfolio.prices.vocabulary import kind
@@ -52,6 +52,10 @@ def join(
             for channel, block in zip(channels, grid.features, strict=True):
                 columns[channel] = block.values[:, j if block.by_asset else 0]
             parts.append(pd.DataFrame(columns))
+    shorter = [table for table, _ in tables if table.left_out]
+    for table in shorter[:LISTED]:
+        findings.note(f"of {quote(table.source)}, {table.left_out}")
+    findings.others("note", len(shorter), "file", " with lines that are left out")
     together = Findings()
     check_currencies(tables, together)
     for finding in together:  # a file that has them all is named already

@@ -25,7 +25,7 @@ def series(source: Any, name: str, dates: np.ndarray, findings: Findings) -> np.
             called ``name`` is read. A number holds from its date until the next one.
         name: Name of the series.
         dates: Dates of the price table, ascending, of shape (rows,).
-        findings: Where a warning goes.
+        findings: Where notes and warnings go.
 
     Raises:
         QfolioError: The source cannot be read, lacks the column, or begins after the prices.
@@ -51,6 +51,8 @@ def series(source: Any, name: str, dates: np.ndarray, findings: Findings) -> np.
             )
     except QfolioError as error:
         raise QfolioError(f"The column {quote(name)} from {quote(table.source)}: {error}") from None
+    if table.left_out:
+        findings.note(f"of {quote(table.source)}, {table.left_out}")
     known = since[order]
     age = (dates[-1] - known[-1]).astype("m8[s]").astype(np.int64) / 86400.0
     if len(known) > 1 and age > max(LATE, MISSED * spacing(known)[1]):
