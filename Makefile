@@ -17,7 +17,7 @@ demo: .venv/installed
 test: .venv/installed-dev
 	$(BIN)/pytest -n 2 --dist loadfile -m "not slow and not optimized"
 
-# All tests: those that learn for long come last, with programs optimized as users have them.
+# Those that learn for long come last, with programs optimized as users have them.
 test-all: .venv/installed-dev
 	$(BIN)/pytest -n 2 --dist loadfile -m "not optimized and not long"
 	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile -m "optimized and not long"

@@ -42,7 +42,7 @@ from qfolio.tasks.pendulum import Pendulum  # noqa: E402
 
 devices.configure()
 
-ENOUGH = 1.5 * 2**30
+ENOUGH = 1.5 * 2**30  # bytes, of each of two processes
 
 
 def pytest_collection_finish():

@@ -37,7 +37,7 @@ CALLS = 50
 a check takes longer than many a function: a test that loops in Python took six times as long."""
 
 CLOSURES = 4
-"""Closures of one function that are checked in a file of tests: to make a check takes long, too."""
+"""Closures of one function that are checked in a file of tests. Making a check takes long, too."""
 
 _calls: Counter[int] = Counter()  # by the address of a function's code, which its closures share
 _made: Counter[int] = Counter()

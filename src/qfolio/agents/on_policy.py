@@ -106,7 +106,7 @@ class OnPolicy(Agent):
     _optimizer = Group(OptimizerConfig)
 
     least_length = 1  # of a rollout
-    gae_lambda = 1.0  # λ of the advantages, a setting of some
+    gae_lambda = 1.0  # λ of the advantages, which A2C and PPO have as a setting
 
     def __check_init__(self) -> None:
         require_counts(self, "rollout_length", self.least_length)

@@ -51,7 +51,8 @@ def test_prices_of_several_times_a_day_say_how_old_they_are():
     table, daily = (Prices(dates, ("A",), np.ones((len(dates), 1))) for dates in (hours, DAYS))
     assert not aged(table, datetime.timedelta(hours=2))
     (said,) = aged(table, datetime.timedelta(hours=3))
-    assert said.startswith("The latest prices, of 2024-01-05 12:00:00, are 3 hours old if ")
+    assert said.startswith("The latest prices, of 2024-01-05 12:00:00, are 3 hours old if their ")
+    assert said.endswith("times are in UTC; the orders are made at them.")
     assert not aged(daily, datetime.timedelta(days=7))
 
 
@@ -85,6 +86,11 @@ def test_holdings_from_before_any_earlier_orders_are_noticed(shares, number):
     said = " ".join(not_traded(holding(shares, 9.0), earlier))
     assert (f"those of record {number} before its trades" in said) == (number is not None)
     assert bool(said) == (number is not None)
+
+
+def test_trades_too_small_to_tell_are_no_sign():
+    """The holdings are those before such trades, and those after them."""
+    assert not not_traded(holding([5, 0], 9.0), [account([5, 0], [5e-6, 0], 1)])
 
 
 @pytest.mark.parametrize(("cash", "said"), [(9.0, True), (9.01, True), (4.0, False), (18.0, False)])

@@ -528,9 +528,10 @@ def test_a_fund_with_a_price_and_a_net_asset_value(tmp_path: Path):
 
 def test_the_first_of_two_tables_is_never_skipped(tmp_path: Path):
     one = "date,A,B\n" + rows(ISO, [["1", "2"]] * 4)
-    for between in ("\nSecond table\n", "", "Total: 4\n"):
+    for between, row in (("\nSecond table\n", 8), ("", 6), ("Total: 4\n", 7)):
         other = "date,A,B,C\n" + rows(ISO, [["3", "4", "5"]] * 4)
-        refusal(write(tmp_path, one + between + other))
+        said = refusal(write(tmp_path, one + between + other))
+        assert f"row {row}: there are 4 fields, but 3 column names" in said
 
 
 def test_rows_below_a_blank_line_are_no_other_table(tmp_path: Path):
@@ -548,6 +549,12 @@ def test_days_of_two_digit_years_are_no_months(tmp_path: Path):
               "200901", "201001", "201102", "201201", "210104"]  # fmt: skip
     text = "date,A,B\n" + rows(stamps, [["1", "2"]] * len(stamps))
     assert "is not a date" in refusal(write(tmp_path, text))
+
+
+def test_zones_in_small_letters(tmp_path: Path):
+    stamps = [f"{day:%d-%b-%Y} 16:00 utc" for day in DAYS]
+    table = load(write(tmp_path, "date,A\n" + rows(stamps, [["1"]] * 4)))
+    assert str(table.dates[0]).startswith("2024-01-29T16:00")
 
 
 def test_a_percent_sign_of_a_feature_is_no_return(tmp_path: Path):

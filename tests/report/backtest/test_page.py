@@ -139,6 +139,11 @@ def test_says_when_strategies_decide(data: BacktestData, calendar: str, said: st
     assert f"Agents and baselines decide on {said}" in text
 
 
+def test_a_calendar_of_every_row_needs_no_sentence(data: BacktestData) -> None:
+    text = Page(render_backtest(replace(data, config={**data.config, "calendar": "daily"}))).text
+    assert "decide on the first" not in text
+
+
 def test_the_terms_are_those_of_the_figures(data: BacktestData) -> None:
     assert "Annualized mean return over volatility." in Page(render_backtest(data)).text
     rate = np.full(len(data.dates), 1e-4)

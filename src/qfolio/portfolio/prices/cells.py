@@ -5,6 +5,7 @@ Ambiguous cells are errors.
 
 import math
 import re
+from collections.abc import Iterable
 from decimal import Decimal
 from numbers import Real
 from typing import Any
@@ -83,7 +84,7 @@ def currencies(cells: np.ndarray) -> set[str]:
 def not_a_number(cell: Any, decimal: str) -> str:
     """Why a cell is not a number, for a message."""
     said = str(cell).strip()
-    text, sign = _bare(said)
+    text, _ = _bare(said)
     other = "," if decimal == "." else "."
     if has_two_readings(said, decimal):
         point = text.replace(",", ".")
@@ -91,7 +92,7 @@ def not_a_number(cell: Any, decimal: str) -> str:
     if other in text and is_number(said, other):
         has, have = ("comma", "points") if other == "," else ("point", "decimal commas")
         return f"{quote(said)} has a decimal {has}, other numbers have {have}"
-    if sign == PERCENT and is_number(said, decimal):
+    if is_percentage(said, decimal):
         return f"{quote(said)} has a percent sign"
     return f"{quote(said)} is not a number"
 
@@ -99,6 +100,16 @@ def not_a_number(cell: Any, decimal: str) -> str:
 def is_number(cell: str, decimal: str = ".") -> bool:
     """Whether a cell is a number with this decimal mark."""
     return _number(cell, decimal, percent=True) is not None
+
+
+def has_numbers(cells: Iterable[str]) -> bool:
+    """Whether one of some cells is a number, with either decimal mark."""
+    return any(is_number(cell) or is_number(cell, ",") for cell in cells)
+
+
+def is_percentage(cell: str, decimal: str) -> bool:
+    """Whether a cell is a number with a percent sign."""
+    return _bare(cell)[1] == PERCENT and is_number(cell, decimal)
 
 
 def has_decimal(cell: str, decimal: str) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.bars import columns_of_kind, pick_prices
-from qfolio.portfolio.prices.cells import is_missing, is_number, numbers
+from qfolio.portfolio.prices.cells import has_numbers, is_missing, is_number, numbers
 from qfolio.portfolio.prices.dates import are_times, read_dates, readable_date, with_times
 from qfolio.portfolio.prices.findings import LISTED, Findings, listing
 from qfolio.portfolio.prices.layout import Table
@@ -284,7 +284,5 @@ def _holds_words(cells: np.ndarray) -> bool:
     if cells.dtype.kind == "f":
         return False
     known = [cell for cell in cells.tolist() if not is_missing(cell)]
-    words = (
-        isinstance(cell, str) and not is_number(cell) and not is_number(cell, ",") for cell in known
-    )
-    return bool(known) and all(words)
+    words = bool(known) and all(isinstance(cell, str) for cell in known)
+    return words and not has_numbers(known)

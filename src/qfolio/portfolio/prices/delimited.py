@@ -12,9 +12,9 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
-from qfolio.portfolio.prices.cells import MISSING, has_decimal
+from qfolio.portfolio.prices.cells import MISSING, has_decimal, has_numbers
 from qfolio.portfolio.prices.dates import begins_row
-from qfolio.portfolio.prices.header import Header, has_numbers, parse_header
+from qfolio.portfolio.prices.header import Header, parse_header
 from qfolio.portfolio.prices.layout import Table
 
 SEPARATORS = ",;\t|"

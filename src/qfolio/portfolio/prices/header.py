@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from qfolio.portfolio.prices.cells import is_missing, is_number
+from qfolio.portfolio.prices.cells import has_numbers, is_missing, is_number
 from qfolio.portfolio.prices.dates import begins_row, readable_date
 from qfolio.portfolio.prices.vocabulary import (
     ASSET_NAMES,
@@ -130,11 +130,6 @@ def _below_text(records: list[list[str]]) -> Header | None:
 def _is_row(record: list[str]) -> bool:
     """Whether a record begins with a date, and has a number."""
     return begins_row(record[0]) and has_numbers(record[1:])
-
-
-def has_numbers(cells: list[str]) -> bool:
-    """Whether one of some cells is a number, with either decimal mark."""
-    return any(is_number(cell) or is_number(cell, ",") for cell in cells)
 
 
 def _setting(record: list[str]) -> str:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from qfolio.core.text import amount, quote
-from qfolio.portfolio.prices.cells import not_a_number
+from qfolio.portfolio.prices.cells import is_percentage, not_a_number
 from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.frequency import every_day, spacing
 from qfolio.portfolio.prices.gaps import Rest
@@ -82,7 +82,7 @@ def check_cells(grid: Grid, findings: Findings) -> None:
 def _complaint(grid: Grid, block: Block, i: int, j: int) -> str:
     cell = grid.table.columns[block.columns[j]][int(grid.lines[i, j])]
     said = not_a_number(cell, grid.table.decimal)
-    if block is grid.prices and said.endswith("percent sign"):
+    if block is grid.prices and is_percentage(str(cell), grid.table.decimal):
         return f"{said}; if it is a return, choose returns='percent' (--returns)"
     return said
 

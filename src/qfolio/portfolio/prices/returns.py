@@ -51,11 +51,11 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid | None:
         known = np.isfinite(rates)
         moved = rates[known & (rates != 0)]
         near = 0.0 if unit == "relative" else usual_relative(block.values)
-        if CLEAR <= near <= (DEPOSIT if unit == "percent" else MOST):
+        if unit == "percent" and near > DEPOSIT:
+            findings.warn(RELATIVES, advice="If so, choose returns='relative' (--returns).")
+        elif near >= CLEAR:
             findings.error(RELATIVES, advice="Choose returns='relative' (--returns).")
             return None
-        if near > DEPOSIT:
-            findings.warn(RELATIVES, advice="If so, choose returns='relative' (--returns).")
         lossless = len(rates) >= FEWEST and moved.size and (moved > 0).all()
         gain = float(np.median(moved)) if lossless else 0.0
         if gain >= GAIN[0]:

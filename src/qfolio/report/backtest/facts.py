@@ -135,8 +135,8 @@ def _long_only(data: BacktestData) -> bool:
 
 
 def _calendar(calendar: str, unit: str) -> str:
-    """When strategies decide, in a sentence; empty if there is no calendar."""
-    if not calendar:
+    """When strategies decide, in a sentence; empty if they do so on every row."""
+    if not calendar or PERIODS.get(calendar) == unit:
         return ""
     if width := band(calendar):
         return (
@@ -144,9 +144,7 @@ def _calendar(calendar: str, unit: str) -> str:
             f"of cash included, is more than {100 * width:.4g}% of the wealth from the weight "
             "held; otherwise, holdings drift."
         )
-    if calendar == "daily" and unit == "day":
-        when = "every day"
-    elif calendar.isdecimal():
+    if calendar.isdecimal():
         when = f"once in {amount(int(calendar), unit)}, counted from the table’s first row"
     else:
         when = f"on the first {unit} of each {PERIODS[calendar]}"
