@@ -11,7 +11,7 @@ from qfolio.tasks.pendulum import Pendulum
 @pytest.mark.optimized
 def test_the_fast_preset_comes_near_the_optimum():
     chosen = preset("fast")
-    run = train(Pendulum(), chosen.build(), episodes=chosen.episodes, seeds=2, seed=100)
+    run = train(Pendulum(), chosen.build(), episodes=chosen.episodes, seeds=4, seed=100)
     regrets = run.grade()["regret_per_seed"]
     assert max(regrets) <= 0.05, regrets
     assert min(regrets) > -0.005, "nothing beats the optimum"
